@@ -1,5 +1,7 @@
 //! `perturb compare`.
 
+mod table;
+
 use std::collections::BTreeSet;
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -11,7 +13,7 @@ use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_records::comparison::{ComparedCondition, ComparedScore, compare};
 use perturb_records::success::{Criterion, Rule};
 use perturb_records::{ExternalEvaluation, FILE, Records};
-use perturb_report::{EnvironmentComparison, INTERVALS_NOTE, comparison_page};
+use perturb_report::{EnvironmentComparison, comparison_page};
 use perturb_settings::sets::TestSet;
 use perturb_text::Table;
 use serde_json::json;
@@ -41,41 +43,52 @@ struct NamedPolicies {
     policies: Vec<(String, ComparedPolicy)>,
 }
 
+/// A comparison, with the rule of success if it is known.
+type Judged = (EnvironmentComparison, Option<String>);
+
 pub(super) fn run(args: &CompareArgs) -> Result<()> {
     args.json.check()?;
     args.html.as_deref().map_or(Ok(()), require_writable)?;
-    let conditions = args.conditions.iter().map(|text| condition(text)).collect::<Result<Vec<_>>>()?;
-    let sets = tested_sets(args, &conditions)?;
-    let tested = test(args, conditions, &sets)?;
-    let compared: Vec<_> = tested.iter().map(by_reference).collect();
-    let names: Vec<String> = sets.iter().map(|set| set.name.clone()).collect();
     let score = match args.score.as_str() {
         "return" => ComparedScore::Return,
         "length" => ComparedScore::Length,
         _ => ComparedScore::Success,
     };
-    let comparison = compare(&compared, &names, score, args.baseline.as_deref())?;
-    let about = &tested[0].1[0].1.about;
-    let of = EnvironmentComparison { environment: about.environment.clone(), comparison };
+    let (of, success) = match table::comparison(args, score)? {
+        Some(compared) => compared,
+        None => tested_comparison(args, score)?,
+    };
     if let Some(path) = &args.html {
         write_atomically(path, comparison_page(&of).as_bytes())?;
     }
     if args.json.json.is_some() {
-        let success = about.success.as_ref().map(ToString::to_string);
         let mut document = json!(of.comparison);
-        document["environment"] = json!(about.environment);
+        document["environment"] = json!(of.environment);
         document["success"] = json!(success);
         args.json.write(document)?;
     }
     if args.json.is_printed() {
         return Ok(());
     }
-    let success = about.success.as_ref().map(|criterion| format!(", success: {criterion}")).unwrap_or_default();
+    let success = success.map(|rule| format!(", success: {rule}")).unwrap_or_default();
     let mut out = output();
-    writeln!(out, "{}{success}", about.environment)?;
+    writeln!(out, "{}{success}", of.environment)?;
     let tables: Vec<String> = of.tables().iter().map(Table::to_text).collect();
     writeln!(out, "{}", tables.join("\n\n"))?;
-    Ok(writeln!(out, "\n{}.\n\n{INTERVALS_NOTE}", of.comparison.verdict)?)
+    Ok(writeln!(out, "\n{}.\n\n{}", of.comparison.verdict, of.note())?)
+}
+
+/// Compares policies that are tested now or have recorded episodes.
+fn tested_comparison(args: &CompareArgs, score: ComparedScore) -> Result<Judged> {
+    let conditions = args.conditions.iter().map(|text| condition(text)).collect::<Result<Vec<_>>>()?;
+    let sets = tested_sets(args, &conditions)?;
+    let tested = test(args, conditions, &sets)?;
+    let compared: Vec<_> = tested.iter().map(by_reference).collect();
+    let names: Vec<String> = sets.iter().map(|set| set.name.clone()).collect();
+    let comparison = compare(&compared, &names, score, args.baseline.as_deref())?;
+    let about = &tested[0].1[0].1.about;
+    let success = about.success.as_ref().map(ToString::to_string);
+    Ok((EnvironmentComparison { environment: about.environment.clone(), comparison }, success))
 }
 
 fn by_reference((name, policies): &TestedPolicies) -> ComparedCondition<'_> {
@@ -83,15 +96,24 @@ fn by_reference((name, policies): &TestedPolicies) -> ComparedCondition<'_> {
     ComparedCondition { name: name.clone(), policies: policies.collect() }
 }
 
-/// Reads a condition, written `NAME=PATH,PATH` or `PATH,PATH`.
-fn condition(text: &str) -> Result<NamedPolicies> {
+/// Splits a condition, written `NAME=PATH,PATH` or `PATH,PATH`, into its name, if it has one, and its paths.
+fn split(text: &str) -> (Option<&str>, Vec<PathBuf>) {
     let (name, paths) = match text.split_once('=') {
         Some((name, paths)) if !name.is_empty() && !name.contains(['/', ',']) => (Some(name), paths),
         _ => (None, text),
     };
-    let paths: Vec<PathBuf> = paths.split(',').map(PathBuf::from).collect();
-    let default = || paths[0].file_stem().unwrap_or(paths[0].as_os_str()).to_string_lossy().into_owned();
-    let name = name.map_or_else(default, str::to_owned);
+    (name, paths.split(',').map(PathBuf::from).collect())
+}
+
+/// Returns the name of a condition that was given none: that of its first path.
+fn default_name(paths: &[PathBuf]) -> String {
+    paths[0].file_stem().unwrap_or(paths[0].as_os_str()).to_string_lossy().into_owned()
+}
+
+/// Reads the policies of a condition.
+fn condition(text: &str) -> Result<NamedPolicies> {
+    let (name, paths) = split(text);
+    let name = name.map_or_else(|| default_name(&paths), str::to_owned);
     let mut policies = Vec::new();
     for path in &paths {
         policies.extend(policies_at(path)?);

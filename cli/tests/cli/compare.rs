@@ -65,3 +65,47 @@ fn conditions_are_compared_over_seeds_and_episodes() {
         assert!(stderr(&output).contains(part), "{}", stderr(&output));
     }
 }
+
+#[test]
+fn rows_of_a_results_table_are_compared() {
+    let table = concat!(env!("CARGO_MANIFEST_DIR"), "/../results/results.parquet");
+    let study = format!("{table}/classic-ff");
+    let chosen = ["--where", "environment=cart-pole", "trained_on=R", "seed=2..6", "algorithm=a2c,ppo"];
+    let json = printed(&[&["compare", &study, "--by", "algorithm", "--json"], &chosen[..]].concat());
+    let told: serde_json::Value = serde_json::from_str(&json).expect("JSON and nothing else");
+    let rows = perturb_records::ResultsTable::read(table.as_ref()).expect("a table");
+    let on_e: Vec<f64> = rows
+        .rows()
+        .iter()
+        .filter(|row| (row.study.as_str(), row.environment.as_str()) == ("classic-ff", "CartPole"))
+        .filter(|row| (row.trained_on.as_str(), row.algorithm.as_str()) == ("R", "ppo") && row.seed > 1)
+        .filter(|row| row.tested_on.as_deref() == Some("E"))
+        .filter_map(|row| Some(row.result()?.success_percent))
+        .collect();
+    let means = told["means"].as_array().expect("means");
+    let it = means.iter().find(|it| it["condition"] == "ppo" && it["tested_on"] == "E").expect("a mean");
+    assert_eq!((on_e.len(), &it["by_seed"]), (5, &serde_json::json!(on_e)));
+    assert_eq!((&told["environment"], &told["from_counts"]), (&"CartPole".into(), &true.into()));
+    let text = printed(
+        &[
+            &["compare", &format!("a={study}"), &format!("b={study}"), "--versions", "E"],
+            &chosen[..4],
+            &["algorithm=ppo"],
+        ]
+        .concat(),
+    );
+    assert!(text.contains("b − a") && text.contains("Rows of a results table have no episodes"), "{text}");
+    for (arguments, part) in [
+        (vec![&study[..]], "one environment; choose its rows"),
+        (vec![&study, "--where", "environment=CartPole"], "several policies of seed"),
+        (vec![&study, "--where", "colour=red"], "a setting, or one of study, cell"),
+        (vec![&study, "--where", "seed=77"], "no row of classic-ff is chosen; the studies of the table are"),
+        (vec![&study, "nowhere"], "results tables alone"),
+        (vec!["nowhere", "--by", "algorithm"], "choose rows of results tables"),
+        (vec![&study, "--success", "code"], "are not tested again"),
+    ] {
+        let output = perturb(&[&["compare"], &arguments[..]].concat()).output().expect("perturb runs");
+        assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
+        assert!(stderr(&output).contains(part), "{}", stderr(&output));
+    }
+}

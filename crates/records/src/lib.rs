@@ -48,5 +48,7 @@ pub use records::{
     RecordedTest, Records, RecordsError, RecordsMetadata,
 };
 pub use results::TestResult;
-pub use results_table::{MergeCounts, ResultsTable, SCHEMA_VERSION, StudyPlan, TableError, TableRow};
+pub use results_table::{
+    MergeCounts, NamedRows, ResultsTable, RowFilter, SCHEMA_VERSION, SELECTION_TEST, StudyPlan, TableError, TableRow,
+};
 pub use scenarios::{Metric, Scenario, TrainedOn, versions};

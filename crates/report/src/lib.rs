@@ -12,6 +12,6 @@ mod report;
 
 pub use heatmap_policies::{PolicyHeatmap, policies_side_by_side};
 pub use report::{
-    EnvironmentComparison, HeatmapPictures, INTERVALS_NOTE, Picture, PictureDrawing, Report, ReportBundle, ReportError,
-    ReportInputs, StudySource, comparison_page, curves_table, heatmap_pictures, save_heatmaps,
+    EnvironmentComparison, HeatmapPictures, Picture, PictureDrawing, Report, ReportBundle, ReportError, ReportInputs,
+    StudySource, comparison_page, curves_table, heatmap_pictures, save_heatmaps,
 };

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use clap::Args;
 use perturb_protocol::Version;
+use perturb_records::RowFilter;
 use perturb_records::success::Rule;
 
 use super::testing::success_rule;
@@ -13,12 +14,15 @@ use super::{JsonArgs, OneOf, PlayArgs, SetArgs, at_least_one, natural};
 #[command(after_help = "Examples:
   perturb compare plain=runs/d1,runs/d2,runs/d3 random=runs/r1,runs/r2,runs/r3
   perturb compare runs/plain runs/random             # folders with a training for each seed
-  perturb compare saved/a saved/b --score return     # of Assessment.save, or --records of perturb evaluate")]
+  perturb compare saved/a saved/b --score return     # of Assessment.save, or --records of perturb evaluate
+  perturb compare results.parquet/classic-ff --by algorithm --where environment=CartPole trained_on=R seed=2..6")]
 pub struct CompareArgs {
     /// Conditions, each with a policy for each seed: the --out folders of trainings, which are tested now; cells of an
     /// experiment, --records files of `perturb evaluate`, or folders that `Assessment.save` wrote in Python, whose
     /// recorded episodes are read; or a folder that has one of these for each seed. The name is by default that of the
-    /// first folder. Policies of trainings with the same seed are pairs, the others by their order.
+    /// first folder. Policies of trainings with the same seed are pairs, the others by their order. A condition may also
+    /// be FILE.parquet or FILE.parquet/STUDY of `perturb export`: the rows that --where chooses, or with --by several
+    /// conditions.
     #[arg(value_name = "[NAME=]PATH[,PATH]", required = true)]
     pub conditions: Vec<String>,
     /// What is compared: success rates, returns or lengths of episodes.
@@ -31,6 +35,13 @@ pub struct CompareArgs {
     /// --parameters or --contexts].
     #[arg(long, value_delimiter = ',')]
     pub versions: Vec<Version>,
+    /// The rows of results tables that are compared: those with one of these values of a column or setting, such as
+    /// algorithm=a2c,ppo or seed=2..6.
+    #[arg(long = "where", value_name = "COLUMN=VALUES", num_args = 1..)]
+    pub filters: Vec<RowFilter>,
+    /// Columns or settings by which rows of results tables are divided into conditions, separated by commas.
+    #[arg(long, value_name = "COLUMN", value_delimiter = ',')]
+    pub by: Vec<String>,
     #[command(flatten)]
     pub set: SetArgs,
     /// Rule that decides about success, as in `perturb evaluate`.

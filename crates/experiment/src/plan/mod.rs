@@ -20,6 +20,7 @@ use serde::{Deserialize, Serialize};
 use file::File;
 pub use groups::Grouping;
 use perturb_files::{self as files, AnyError, FileError};
+pub use perturb_records::SELECTION_TEST;
 use perturb_records::TrainedOn;
 use perturb_records::success::{Criterion, Rule};
 use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
@@ -88,9 +89,6 @@ impl std::str::FromStr for Selection {
         known.ok_or_else(|| ValueError::new("selection", format!("`{text}`"), "\"paper\" or \"clean\""))
     }
 }
-
-/// The name, in results and records, of the test that selects configurations. No parameter set may have this name.
-pub const SELECTION_TEST: &str = "selection";
 
 /// A cell of the experiment: one training and its tests.
 #[derive(Clone, Debug, PartialEq)]

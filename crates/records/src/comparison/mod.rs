@@ -1,17 +1,20 @@
 //! Statistical comparison of conditions, such as two ways of training. It accounts for two sources of chance: the seeds
 //! of the trainings and the episodes of the tests.
 
+mod check;
 mod scores;
+mod table;
 mod verdict;
 
-use perturb_settings::{ValueError, require};
+use perturb_settings::ValueError;
 use serde::{Deserialize, Serialize};
 
 use crate::records::Records;
 use crate::statistics::{
     Z_95, holm, mean, mean_with_t_interval, probability_of_improvement, t_test_p, wilson_of_share,
 };
-use scores::{EpisodeScores, share_episodes};
+use scores::{TestScores, share_episodes};
+pub use table::{TableCondition, compare_rows};
 
 /// A condition to compare: a group of policies that differ only in their seed.
 #[derive(Clone, Debug)]
@@ -53,7 +56,8 @@ pub struct ConditionMean {
     pub episodes: usize,
     /// The 95 % interval of the mean over episodes, [low, high]. It supports conclusions about the same policies in
     /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval with an
-    /// effective number of episodes, because policies that play the same episodes are not independent.
+    /// effective number of episodes, because policies that play the same episodes are not independent. `None` if
+    /// only the means of policies are known.
     pub episodes_95: Option<[f64; 2]>,
 }
 
@@ -77,7 +81,8 @@ pub struct ConditionDifference {
     /// The 95 % interval of the difference over policies, [low, high]: a t interval over pairs, or Welch's interval if
     /// policies are not paired. `None` if either condition has fewer than three policies.
     pub seeds_95: Option<[f64; 2]>,
-    /// The 95 % interval of the difference over episodes, [low, high].
+    /// The 95 % interval of the difference over episodes, [low, high]. `None` if only the means of policies are
+    /// known.
     pub episodes_95: Option<[f64; 2]>,
     /// Whether all policies of both conditions played the same episodes. If so, `episodes_95` is computed from the
     /// difference in each episode.
@@ -105,6 +110,9 @@ pub struct ConditionComparison {
     pub differences: Vec<ConditionDifference>,
     /// The result of the whole comparison in words.
     pub verdict: String,
+    /// Whether the tests are rows of a results table, which have counts and means instead of episodes. Then only success
+    /// rates have an interval over episodes.
+    pub from_counts: bool,
 }
 
 /// Compares the scores of conditions on each of the test sets `sets`. With a `baseline`, compares every other condition
@@ -120,13 +128,24 @@ pub fn compare(
     score: ComparedScore,
     baseline: Option<&str>,
 ) -> Result<ConditionComparison, ValueError> {
-    check(conditions, sets, baseline)?;
+    let names: Vec<_> = conditions.iter().map(|it| (it.name.as_str(), it.policies.len())).collect();
+    check::names(&names, baseline)?;
+    check::records(conditions, sets)?;
+    Ok(compared(sets, score, baseline, |set| conditions.iter().map(|it| condition_tested_on(it, set, score)).collect()))
+}
+
+/// Compares the conditions that `tested` returns for each of `sets`.
+fn compared<'a>(
+    sets: &[String],
+    score: ComparedScore,
+    baseline: Option<&str>,
+    tested: impl Fn(&str) -> Vec<TestedCondition<'a>>,
+) -> ConditionComparison {
     let (mut means, mut differences) = (Vec::new(), Vec::new());
     for set in sets {
-        let tested: Vec<TestedCondition<'_>> =
-            conditions.iter().map(|it| TestedCondition::new(it, set, score)).collect();
+        let tested = tested(set);
         means.extend(tested.iter().map(|condition| condition.mean(set, score)));
-        let pairs: Vec<[usize; 2]> = match baseline.and_then(|name| conditions.iter().position(|it| it.name == name)) {
+        let pairs: Vec<[usize; 2]> = match baseline.and_then(|name| tested.iter().position(|it| it.name == name)) {
             Some(y) => (0..tested.len()).filter(|x| *x != y).map(|x| [x, y]).collect(),
             None => (0..tested.len()).flat_map(|x| (0..x).map(move |y| [x, y])).collect(),
         };
@@ -143,100 +162,45 @@ pub fn compare(
         it.verdict = verdict::of_difference(it, score, compared);
     }
     let verdict = verdict::of_all(&differences, score, compared);
-    Ok(ConditionComparison { score, means, differences, verdict })
-}
-
-fn check(conditions: &[ComparedCondition<'_>], sets: &[String], baseline: Option<&str>) -> Result<(), ValueError> {
-    require(!conditions.is_empty(), "a comparison", "of nothing", "of at least one condition")?;
-    require(!sets.is_empty(), "a comparison", "without tests", "in tests that all conditions have")?;
-    let mut names = std::collections::BTreeSet::new();
-    for condition in conditions {
-        let name = &condition.name;
-        require(
-            !condition.policies.is_empty(),
-            format!("condition {name}"),
-            "without policies",
-            "of at least one policy",
-        )?;
-        require(
-            names.insert(name),
-            "the name of a condition",
-            format!("`{name}` twice"),
-            "another for each condition",
-        )?;
-    }
-    if let Some(name) = baseline {
-        let expected = conditions.iter().map(|it| it.name.as_str()).collect::<Vec<_>>().join(", ");
-        require(
-            conditions.iter().any(|it| it.name == name),
-            "the baseline",
-            format!("`{name}`"),
-            format!("one of {expected}"),
-        )?;
-    }
-    // All policies must have the environment, the success rule and the sets of the first policy.
-    let first = conditions[0].policies[0].1;
-    for ComparedCondition { name, policies } in conditions {
-        for (_, records) in policies {
-            let (about, expected) = (&records.about, &first.about);
-            let what = |what: &str| format!("{what} of {name}");
-            let environment = |it: &crate::RecordsMetadata| format!("{} (revision {})", it.environment, it.revision);
-            let same = (&about.environment, about.revision) == (&expected.environment, expected.revision);
-            require(
-                same,
-                what("the environment"),
-                environment(about),
-                format!("{}, like the others'", environment(expected)),
-            )?;
-            let rule =
-                |it: &crate::RecordsMetadata| it.success.as_ref().map_or("the server's".into(), ToString::to_string);
-            let same = about.success == expected.success;
-            require(same, what("the rule of success"), rule(about), format!("{}, like the others'", rule(expected)))?;
-            for set in sets {
-                let test =
-                    |it: &Records| it.about.tests.iter().find(|test| test.set.name == *set).map(|it| it.set.clone());
-                let tested = about.tests.iter().map(|test| test.set.name.as_str()).collect::<Vec<_>>().join(", ");
-                let (own, others) = (test(records), test(first));
-                require(own.is_some(), what("the list of tests"), tested, format!("one with {set}, like the others'"))?;
-                require(
-                    own == others,
-                    what(&format!("the set {set}")),
-                    "of other parameters",
-                    "the same in all conditions",
-                )?;
-            }
-        }
-    }
-    Ok(())
+    ConditionComparison { score, means, differences, verdict, from_counts: false }
 }
 
 /// The scores of a condition's policies on one test set.
 struct TestedCondition<'a> {
     name: &'a str,
-    keys: Vec<&'a str>,
-    policies: Vec<EpisodeScores>,
+    /// The keys that pair policies.
+    keys: Vec<String>,
+    policies: Vec<TestScores>,
 }
 
-impl<'a> TestedCondition<'a> {
-    fn new(condition: &'a ComparedCondition<'_>, set: &str, score: ComparedScore) -> Self {
-        Self {
-            name: &condition.name,
-            keys: condition.policies.iter().map(|(key, _)| key.as_str()).collect(),
-            policies: condition.policies.iter().map(|(_, records)| EpisodeScores::new(records, set, score)).collect(),
-        }
+fn condition_tested_on<'a>(
+    condition: &'a ComparedCondition<'_>,
+    set: &str,
+    score: ComparedScore,
+) -> TestedCondition<'a> {
+    TestedCondition {
+        name: &condition.name,
+        keys: condition.policies.iter().map(|(key, _)| key.clone()).collect(),
+        policies: condition.policies.iter().map(|(_, records)| TestScores::of_records(records, set, score)).collect(),
     }
+}
 
+impl TestedCondition<'_> {
     fn by_seed(&self) -> Vec<f64> {
-        self.policies.iter().map(|policy| mean(policy.values.iter().copied())).collect()
+        self.policies.iter().map(|policy| policy.mean).collect()
     }
 
     /// Returns the scores in independent groups. If all policies played the same episodes, there is one group: the mean
-    /// score over policies for each episode. Otherwise each policy's scores are a group.
-    fn strata(&self) -> Vec<Vec<f64>> {
-        if share_episodes(&self.policies) {
-            return vec![scores::mean_by_episode(&self.policies)];
+    /// score over policies for each episode. Otherwise each policy's scores are a group. Returns `None` if only the means
+    /// of policies are known.
+    fn strata(&self) -> Option<Vec<Vec<f64>>> {
+        if self.policies.iter().any(|policy| policy.values.is_empty()) {
+            return None;
         }
-        self.policies.iter().map(|policy| policy.values.clone()).collect()
+        if share_episodes(&self.policies) {
+            return Some(vec![scores::mean_by_episode(&self.policies)]);
+        }
+        Some(self.policies.iter().map(|policy| policy.values.clone()).collect())
     }
 
     fn mean(&self, set: &str, score: ComparedScore) -> ConditionMean {
@@ -249,13 +213,13 @@ impl<'a> TestedCondition<'a> {
             mean,
             seeds_95: mean_with_t_interval(std::slice::from_ref(&by_seed)).and_then(|it| it.interval_95),
             by_seed,
-            episodes: self.policies.iter().map(|policy| policy.values.len()).min().unwrap_or(0),
-            episodes_95: match score {
+            episodes: self.policies.iter().map(|policy| policy.episodes).min().unwrap_or(0),
+            episodes_95: strata.and_then(|strata| match score {
                 ComparedScore::Success => Some(success_interval(mean, &strata)),
                 ComparedScore::Return | ComparedScore::Length => {
                     mean_with_t_interval(&strata).and_then(|it| it.interval_95)
                 }
-            },
+            }),
         }
     }
 }
@@ -283,7 +247,7 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     };
     let interval = mean_with_t_interval(&strata).and_then(|it| it.interval_95);
     // Over episodes: a t interval of the differences if both played the same episodes, else a normal interval.
-    let all: Vec<EpisodeScores> = x.policies.iter().chain(&y.policies).cloned().collect();
+    let all: Vec<TestScores> = x.policies.iter().chain(&y.policies).cloned().collect();
     let same_episodes = share_episodes(&all);
     let difference = mean(of_x.iter().copied()) - mean(of_y.iter().copied());
     let episodes_95 = if same_episodes {
@@ -291,8 +255,10 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
         let by_episode: Vec<f64> = of_x.iter().zip(of_y).map(|(x, y)| x - y).collect();
         mean_with_t_interval(&[by_episode]).and_then(|it| it.interval_95)
     } else {
-        let half = Z_95 * (scores::variance_of_mean(&x.strata()) + scores::variance_of_mean(&y.strata())).sqrt();
-        Some([difference - half, difference + half])
+        x.strata().zip(y.strata()).map(|(x, y)| {
+            let half = Z_95 * (scores::variance_of_mean(&x) + scores::variance_of_mean(&y)).sqrt();
+            [difference - half, difference + half]
+        })
     };
     ConditionDifference {
         x: x.name.to_owned(),
@@ -314,8 +280,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
 
 /// Returns pairs of indices into `x` and `y` that have the same key, in the order of `x`. Returns `None` unless both
 /// have the same keys, each only once.
-fn pairs(x: &[&str], y: &[&str]) -> Option<Vec<[usize; 2]>> {
-    let distinct: std::collections::BTreeSet<&&str> = x.iter().collect();
+fn pairs(x: &[String], y: &[String]) -> Option<Vec<[usize; 2]>> {
+    let distinct: std::collections::BTreeSet<&String> = x.iter().collect();
     if x.len() != y.len() || distinct.len() != x.len() {
         return None;
     }

@@ -2,41 +2,66 @@
 
 use super::ComparedScore;
 use crate::records::Records;
+use crate::results_table::TableRow;
 use crate::statistics::mean;
 
 /// The seed, the environment index and the episode index, which together identify an episode of a test.
 type EpisodeAddress = (u64, u32, u64);
 
-/// The scores of a policy's episodes in one test, in recorded order.
+/// The scores of a policy in one test.
 #[derive(Clone, Debug, PartialEq)]
-pub(super) struct EpisodeScores {
+pub(super) struct TestScores {
+    /// The address of each episode, in their order; empty if the addresses are not known.
     addresses: Vec<EpisodeAddress>,
-    /// The score of each episode, in the order of `addresses`.
+    /// The score of each episode, in recorded order; empty if only their mean is known.
     pub(super) values: Vec<f64>,
+    /// The mean score.
+    pub(super) mean: f64,
+    /// The number of episodes.
+    pub(super) episodes: usize,
 }
 
-impl EpisodeScores {
-    pub(super) fn new(records: &Records, set: &str, score: ComparedScore) -> Self {
+impl TestScores {
+    pub(super) fn of_records(records: &Records, set: &str, score: ComparedScore) -> Self {
         let rows = || records.episodes_on(set);
         let value = |row: &crate::EpisodeRecord| match score {
             ComparedScore::Success => 100.0 * f64::from(u8::from(row.success)),
             ComparedScore::Return => row.episode_return,
             ComparedScore::Length => f64::from(row.length),
         };
+        let values: Vec<f64> = rows().map(value).collect();
         Self {
             addresses: rows().map(|row| (row.seed, row.environment_index, row.episode_index)).collect(),
-            values: rows().map(value).collect(),
+            mean: mean(values.iter().copied()),
+            episodes: values.len(),
+            values,
         }
+    }
+
+    /// Returns the scores of a row of a results table. Successes are known by their number, returns and lengths by their
+    /// mean. `None` for a failed cell.
+    pub(super) fn of_row(row: &TableRow, score: ComparedScore) -> Option<Self> {
+        let result = row.result()?;
+        let (episodes, successes) = (usize::try_from(row.episodes?).ok()?, usize::try_from(row.successes?).ok()?);
+        let (mean, values) = match score {
+            ComparedScore::Success => {
+                let value = |episode| if episode < successes { 100.0 } else { 0.0 };
+                (result.success_percent, (0..episodes).map(value).collect())
+            }
+            ComparedScore::Return => (result.mean_return, Vec::new()),
+            ComparedScore::Length => (result.mean_length, Vec::new()),
+        };
+        Some(Self { addresses: Vec::new(), values, mean, episodes })
     }
 }
 
-/// Returns whether all policies played the same episodes.
-pub(super) fn share_episodes(policies: &[EpisodeScores]) -> bool {
-    policies.windows(2).all(|two| two[0].addresses == two[1].addresses)
+/// Returns whether all policies are known to have played the same episodes.
+pub(super) fn share_episodes(policies: &[TestScores]) -> bool {
+    policies.windows(2).all(|two| !two[0].addresses.is_empty() && two[0].addresses == two[1].addresses)
 }
 
 /// Returns for each episode the mean score over `policies`, which must have played the same episodes.
-pub(super) fn mean_by_episode(policies: &[EpisodeScores]) -> Vec<f64> {
+pub(super) fn mean_by_episode(policies: &[TestScores]) -> Vec<f64> {
     let episodes = policies.first().map_or(0, |policy| policy.values.len());
     (0..episodes).map(|episode| mean(policies.iter().map(|policy| policy.values[episode]))).collect()
 }

@@ -4,6 +4,7 @@ use rstest::rstest;
 use super::*;
 use crate::fixture::{assessed, episode};
 use crate::records::Records;
+use crate::results_table::{SELECTION_TEST, TableRow};
 
 /// Returns records of a policy's tests on D and R. Each test has an episode for each of these returns; a return of at
 /// least 5 is a success.
@@ -117,6 +118,79 @@ fn other_episodes_are_compared_as_such() {
     assert!(!it.same_episodes && (low + half).abs() < 1e-5 && (high - half).abs() < 1e-5, "{low} {high}");
     let same = &compared(&x, &x, ComparedScore::Return).differences[0];
     assert_eq!((same.same_episodes, same.episodes_95), (true, Some([0.0, 0.0])));
+}
+
+/// A row of a study's cell, by its algorithm and seed.
+fn table_row(algorithm: &str, seed: u64, tested_on: &str, successes: u64) -> TableRow {
+    TableRow {
+        study: "study".into(),
+        cell: format!("{algorithm}-{seed}"),
+        environment: "CartPole".into(),
+        revision: Some(1),
+        algorithm: algorithm.into(),
+        trained_on: "R".into(),
+        tested_on: Some(tested_on.into()),
+        seed,
+        episodes: Some(100),
+        successes: Some(successes),
+        mean_return: Some(successes as f64 / 3.0),
+        mean_length: Some(1.0),
+        settings: format!("{{\"algorithm\":\"{algorithm}\",\"seed\":{seed}}}"),
+        ..TableRow::default()
+    }
+}
+
+fn rows<'a>(name: &str, rows: &'a [TableRow]) -> TableCondition<'a> {
+    TableCondition { name: name.into(), rows: rows.iter().collect() }
+}
+
+#[test]
+fn rows_of_a_table_give_the_numbers_of_episodes() {
+    // The same counts as episodes, in other episodes for each policy.
+    let counts = [[30, 60, 90], [20, 40, 90]];
+    let policy = |seed: u64, successes: u64| {
+        let steps: Vec<u32> = (0..100).map(|episode| if episode < successes { 9 } else { 1 }).collect();
+        let mut records = policy(&steps);
+        records.episodes.iter_mut().for_each(|episode| episode.seed = seed);
+        records
+    };
+    let [x, y] = counts.map(|counts| [0, 1, 2].map(|seed| policy(10 * counts[1] + seed, counts[seed as usize])));
+    let expected = compared(&x, &y, ComparedScore::Success);
+    let table = |name, counts: [u64; 3]| {
+        let row = |seed| table_row(name, seed, "D", counts[seed as usize]);
+        let intermediate = TableRow { successes: Some(1), ..row(0) };
+        let failed = TableRow { tested_on: None, episodes: None, ..table_row(name, 7, "D", 0) };
+        vec![intermediate, row(0), row(1), row(2), failed, table_row(name, 0, SELECTION_TEST, 5)]
+    };
+    let (of_x, of_y) = (table("x", counts[0]), table("y", counts[1]));
+    let conditions = [rows("y", &of_y), rows("x", &of_x)];
+    let got = compare_rows(&conditions, None, ComparedScore::Success, None).unwrap();
+    assert!(got.from_counts && !expected.from_counts);
+    assert_eq!(ConditionComparison { from_counts: false, ..got }, expected);
+    let by_return = compare_rows(&conditions, None, ComparedScore::Return, None).unwrap();
+    assert_eq!((by_return.means[1].mean, by_return.means[1].episodes_95), (20.0, None));
+    assert_eq!((by_return.differences[0].episodes_95, by_return.differences[0].seeds_95.is_some()), (None, true));
+}
+
+#[test]
+fn rows_that_are_no_conditions_are_refused() {
+    let error = |conditions: &[TableCondition<'_>], sets: Option<&[String]>| {
+        compare_rows(conditions, sets, ComparedScore::Success, None).unwrap_err().to_string()
+    };
+    let both = [table_row("a2c", 1, "D", 1), table_row("ppo", 1, "D", 1)];
+    let told = error(&[rows("all", &both)], None);
+    assert!(told.contains("several policies of seed 1, which differ by algorithm"), "{told}");
+    let other = [TableRow { environment: "Acrobot".into(), ..both[1].clone() }];
+    let told = error(&[rows("a", &both[..1]), rows("b", &other)], None);
+    assert!(told.contains("in Acrobot (revision 1), CartPole (revision 1), but must be one environment"), "{told}");
+    let told = error(&[rows("a", &both[..1])], Some(&["E".to_owned()]));
+    assert!(told.contains("sets that all policies were tested on: D"), "{told}");
+    let own = [table_row("a2c", 1, "long", 1)];
+    let elsewhere = [TableRow { study: "other".into(), ..own[0].clone() }];
+    assert!(compare_rows(&[rows("a", &own)], None, ComparedScore::Success, None).is_ok());
+    let told = error(&[rows("a", &own), rows("b", &elsewhere)], None);
+    assert!(told.contains("without tests"), "studies may call different sets by the same name: {told}");
+    assert!(error(&[rows("a", &[])], None).contains("without policies"));
 }
 
 #[test]

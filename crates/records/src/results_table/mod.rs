@@ -3,6 +3,7 @@
 //!
 //! `docs/results-table.md` describes every column.
 
+mod choice;
 mod columns;
 
 use std::collections::{BTreeMap, HashMap, HashSet};
@@ -14,9 +15,12 @@ use serde::{Deserialize, Serialize};
 use crate::parquet_file::{ParquetFile, encode, one_group};
 use crate::results::TestResult;
 use crate::statistics::wilson;
+pub use choice::{NamedRows, RowFilter};
 
 /// Version of the table's columns. Increase it when older programs could misread a table.
 pub const SCHEMA_VERSION: u32 = 1;
+/// The name, in results and records, of the test that selects configurations. No parameter set may have this name.
+pub const SELECTION_TEST: &str = "selection";
 /// The name of the Parquet schema.
 const MESSAGE: &str = "results";
 
@@ -40,7 +44,7 @@ pub struct StudyPlan {
 }
 
 /// A row of the table: the result of a test, or the failure of a cell, which is a training with its tests.
-#[derive(Clone, Debug, PartialEq)]
+#[derive(Clone, Debug, Default, PartialEq)]
 pub struct TableRow {
     /// Version of the columns when this row was written.
     pub schema_version: u32,
@@ -163,6 +167,18 @@ impl ResultsTable {
         }
         let rows = columns::decode(&file).map_err(|error| damaged(error.to_string()))?;
         Ok(Some(Self { studies, rows }))
+    }
+
+    /// Finds the table that `path` names, as FILE.parquet or FILE.parquet/STUDY. Returns the file, the table, and STUDY,
+    /// which is empty without one and need not be in the table. Returns `None` if no part of `path` is a Parquet file.
+    ///
+    /// # Errors
+    /// [`TableError`].
+    pub fn find(path: &Path) -> Result<Option<(PathBuf, Self, String)>, TableError> {
+        let is_table = |path: &&Path| path.extension().is_some_and(|ending| ending == "parquet") && path.is_file();
+        let Some(file) = path.ancestors().find(is_table) else { return Ok(None) };
+        let study = path.strip_prefix(file).unwrap_or(Path::new("")).display().to_string();
+        Ok(Some((file.to_owned(), Self::read(file)?, study)))
     }
 
     /// Writes the table atomically.

@@ -124,3 +124,24 @@ fn columns_are_found_by_name_and_missing_ones_are_named() {
     let message = ResultsTable::read(&directory.path().join("none")).unwrap_err().to_string();
     assert!(message.starts_with("there is no results table"), "{message}");
 }
+
+#[test]
+fn rows_are_chosen_by_their_values_and_grouped() {
+    let table = table();
+    let chosen = |study: Option<&str>, filters: &[&str], by: &[&str]| -> Result<Vec<(String, usize)>, String> {
+        let filters: Vec<RowFilter> = filters.iter().map(|text| text.parse().unwrap()).collect();
+        let by: Vec<String> = by.iter().map(|&column| column.to_owned()).collect();
+        let groups = table.choose(study, &filters, &by).map_err(|error| error.to_string())?;
+        Ok(groups.into_iter().map(|(name, rows)| (name, rows.len())).collect())
+    };
+    assert_eq!(chosen(None, &[], &[]), Ok(vec![(String::new(), 4)]));
+    assert_eq!(chosen(Some("one"), &["tested_on=d"], &["cell"]), Ok(vec![("a".into(), 1), ("b".into(), 1)]));
+    let by_rate =
+        chosen(None, &["environment=cart-pole", "run=1..2", "learning_rate=3e-4"], &["study", "learning_rate"]);
+    assert_eq!(by_rate, Ok(vec![("one learning_rate=0.0003".into(), 3), ("two learning_rate=0.0003".into(), 1)]));
+    assert_eq!(chosen(None, &["run=3..9"], &[]), Ok(vec![]));
+    assert_eq!(chosen(None, &["cell=b,c"], &[]), Ok(vec![(String::new(), 1)]));
+    assert!(chosen(None, &["colour=red"], &[]).unwrap_err().contains("a setting, or one of study, cell, environment"));
+    assert!("algorithm".parse::<RowFilter>().unwrap_err().to_string().contains("COLUMN=VALUES"));
+    assert!("seed=a..b".parse::<RowFilter>().is_err());
+}

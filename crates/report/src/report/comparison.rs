@@ -7,10 +7,15 @@ use perturb_records::{ExternalEvaluation, ExternalPolicy, Records};
 use perturb_text::Table;
 
 /// Explanation, for users, of the intervals in a comparison.
-pub const INTERVALS_NOTE: &str = "\
+const INTERVALS_NOTE: &str = "\
 All intervals are 95 % intervals. Intervals over seeds are t intervals: they cover the mean in 95 % of cases, even with\n\
 three seeds, if the means of seeds are normally distributed. Fewer than three seeds have no interval. Intervals over\n\
 episodes describe these policies in other episodes. p is the p-value of t tests over seeds, with Holm's correction.";
+
+/// Explanation, for users, of the intervals that a comparison of rows of a results table lacks.
+const COUNTS_NOTE: &str = "\
+Rows of a results table have no episodes. Intervals of success rates over episodes are from the numbers of successes, as if\n\
+all policies had played different episodes. Returns and lengths have no interval over episodes.";
 
 /// The comparison of several conditions in one environment.
 #[derive(Clone, Debug, PartialEq)]
@@ -57,6 +62,11 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
 }
 
 impl EnvironmentComparison {
+    /// Returns the explanation of the intervals.
+    pub fn note(&self) -> String {
+        if self.comparison.from_counts { format!("{INTERVALS_NOTE}\n{COUNTS_NOTE}") } else { INTERVALS_NOTE.into() }
+    }
+
     /// Returns the table of means and, if there are several conditions, the table of differences.
     pub fn tables(&self) -> Vec<Table> {
         let differences = (!self.comparison.differences.is_empty()).then(|| self.differences_table());

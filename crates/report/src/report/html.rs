@@ -6,7 +6,7 @@ use percent_encoding::{AsciiSet, NON_ALPHANUMERIC, percent_encode};
 use perturb_experiment::{BudgetAxis, distinct};
 use perturb_text::{Column, Entry, Table};
 
-use super::comparison::{EnvironmentComparison, INTERVALS_NOTE};
+use super::comparison::EnvironmentComparison;
 use super::finding::listed;
 use super::{MISSING, Picture, PictureDrawing, Report, ReportBundle};
 use crate::plot::{self, CurveQuantity, PlotError, draw_curves, svg};
@@ -186,7 +186,7 @@ fn comparison_subsection(of: &EnvironmentComparison) -> Subsection {
     let content = html! {
         p { (of.comparison.verdict) "." }
         @for table in tables { (table) }
-        p.notes { (INTERVALS_NOTE) }
+        p.notes { (of.note()) }
     };
     Subsection { title: of.environment.clone(), content }
 }

@@ -29,7 +29,7 @@ use numbers::MethodMetrics;
 use profiles::Profile;
 use sweeps::SweepPoint;
 
-pub use comparison::{EnvironmentComparison, INTERVALS_NOTE};
+pub use comparison::EnvironmentComparison;
 pub use curves::curves_table;
 pub use heatmap_pictures::{HeatmapPictures, heatmap_pictures, save_heatmaps};
 pub use html::comparison_page;

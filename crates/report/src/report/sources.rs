@@ -220,15 +220,12 @@ impl StudySource {
     /// Reads the study that `path` names: `FILE.parquet/STUDY`, or `FILE.parquet` if it contains a single study.
     /// Returns `None` if `path` does not lead to a Parquet file.
     fn find(path: &Path) -> Result<Option<Self>, ReportError> {
-        let is_table = |path: &&Path| path.extension().is_some_and(|ending| ending == "parquet") && path.is_file();
-        let Some(file) = path.ancestors().find(is_table) else { return Ok(None) };
-        let table = ResultsTable::read(file)?;
-        let study = path.strip_prefix(file).unwrap_or(Path::new("")).display().to_string();
+        let Some((file, table, study)) = ResultsTable::find(path)? else { return Ok(None) };
         let known: Vec<String> = table.studies.keys().cloned().collect();
         let name = match &known[..] {
             [only] if study.is_empty() => only.clone(),
             _ if known.contains(&study) => study,
-            _ => return Err(ReportError::NoStudy { table: file.to_owned(), study, known }),
+            _ => return Err(ReportError::NoStudy { table: file, study, known }),
         };
         let episodes = StudyEpisodes::path(file.parent().unwrap_or(Path::new("")), &name);
         Ok(Some(Self { table, name, path: path.to_owned(), episodes }))
