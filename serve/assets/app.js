@@ -5,7 +5,7 @@
   // Okabe and Ito's colours, for all kinds of colour vision.
   const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"];
   const NARROWEST = 200, HEIGHT = 220;
-  // Charts of a training, by the names of their elements.
+  // Charts of trainings, by the names of their elements.
   const CURVES = {
     return: { colour: 0 },
     success: { colour: 2, range: [0, 100] },
@@ -105,18 +105,20 @@
     figure.dataset.reach = curve[by][curve[by].length - 1];
   }
 
-  // Draws the curves of the running cells, with one colour for each kind of cell.
-  function drawCells(figure, cells) {
-    figure.parentElement.hidden = cells.length === 0;
-    if (cells.length === 0) return clear(figure);
-    const kinds = [...new Set(cells.map((cell) => cell.kind))];
-    const colour = (cell) => COLOURS[kinds.indexOf(cell.kind) % COLOURS.length];
-    const data = uPlot.join(cells.map((cell) => [cell.episodes, cell.success]));
-    const series = cells.map((cell) => ({
-      label: cell.id, stroke: colour(cell), width: 1.5, spanGaps: true, points: { show: false },
+  // Draws the curves of several runs, with one colour for each kind.
+  function drawRuns(figure, runs, name) {
+    figure.parentElement.hidden = runs.length === 0;
+    if (runs.length === 0) return clear(figure);
+    const by = over();
+    const kinds = [...new Set(runs.map((run) => run.kind))];
+    const colour = (run) => COLOURS[kinds.indexOf(run.kind) % COLOURS.length];
+    const data = uPlot.join(runs.map((run) => [run[by], run[name]]));
+    const series = runs.map((run) => ({
+      label: run.id, stroke: colour(run), width: 1.5, spanGaps: true, points: { show: false },
     }));
-    const key = cells.map((cell) => cell.id).join();
-    plot(figure, key, data, (place) => options(place, series, [0, 100], "episodes"));
+    const key = [by, ...runs.map((run) => run.id)].join();
+    const label = by === "steps" ? "environment steps" : "episodes";
+    plot(figure, key, data, (place) => options(place, series, CURVES[name].range, label));
     figure.dataset.points = data[0].length;
     let legend = figure.querySelector("ul");
     if (!legend) {
@@ -136,7 +138,9 @@
   function draw() {
     if (!charts) return;
     for (const figure of document.querySelectorAll("figure.chart")) {
-      if (figure.dataset.chart === "cells") drawCells(figure, charts.cells ?? []);
+      const name = figure.dataset.chart;
+      if (name === "cells") drawRuns(figure, charts.cells ?? [], "success");
+      else if (charts.runs) drawRuns(figure, charts.runs.filter((run) => run.episodes.length > 1), name);
       else drawCurve(figure, charts.curve);
     }
   }
@@ -218,6 +222,19 @@
     if (address && document.activeElement !== had) place.querySelector(`[href="${CSS.escape(address)}"]`)?.focus();
   }
 
+  // Shows the link to the curves of the chosen trainings once there are two.
+  const charted = document.getElementById("charted");
+  const curves = charted?.getAttribute("href");
+  function showChosen() {
+    if (!charted) return;
+    const most = Number(charted.dataset.most);
+    const chosen = [...document.querySelectorAll("input[name=charted]:checked")].map((input) => input.value);
+    charted.href = `${curves}?runs=${chosen.slice(0, most).join()}`;
+    charted.textContent = chosen.length > most ? `Curves of the first ${most} chosen trainings in one chart`
+      : `Curves of ${chosen.length} trainings in one chart`;
+    charted.parentElement.hidden = chosen.length < 2;
+  }
+
   function apply(update) {
     if (update.gone) return say(update.gone, "lost");
     say("live", "live");
@@ -231,6 +248,7 @@
     }
     charts = update.charts;
     draw();
+    showChosen();
     showReport(update.report);
     document.body.dataset.updates = Number(document.body.dataset.updates ?? 0) + 1;
   }
@@ -260,6 +278,7 @@
     source = null;
   });
   for (const input of document.querySelectorAll("input[name=over]")) input.addEventListener("change", draw);
+  document.addEventListener("change", showChosen);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
   localTimes(document);
   listen();

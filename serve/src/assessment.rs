@@ -1,5 +1,6 @@
 //! The state of a saved assessment. It is read again when its files change.
 
+use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use perturb_experiment::runs::{AssessmentStatus, LEADS_OUT, RunSummary};
@@ -44,6 +45,19 @@ impl LiveAssessment {
     /// Returns the status, or the reason why it could not be read.
     pub(crate) fn status(&self) -> Result<&AssessmentStatus, &str> {
         self.status.as_ref().map_err(String::as_str)
+    }
+
+    /// Returns a hash of the files' stamps.
+    pub(crate) fn report_fingerprint(&self) -> u64 {
+        let mut hasher = DefaultHasher::new();
+        self.stamps.hash(&mut hasher);
+        hasher.finish()
+    }
+
+    /// Returns the folder for the report, or the reason why none can be built.
+    pub(crate) fn report_folder(&self) -> Result<PathBuf, String> {
+        self.status().map_err(|reason| format!("this assessment is not understood: {reason}"))?;
+        Ok(self.path.clone())
     }
 
     pub(crate) fn summary(&self) -> RunSummary {

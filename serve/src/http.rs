@@ -66,6 +66,7 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
         .route("/", get(index))
         .route("/run/", get(run))
         .route("/run/{*path}", get(run))
+        .route("/curves", get(curves))
         .route("/report/", get(report))
         .route("/report/{*path}", get(report))
         .route("/file/{*path}", get(file))
@@ -159,8 +160,22 @@ async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     }
 }
 
-async fn index_events(State(state): State<Arc<AppState>>, Extension(peer): Extension<ClientAddress>) -> Response {
-    events(&state, Topic::Index, peer)
+async fn curves(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
+    let Some(chosen) = chosen_trainings(&uri) else { return error_page(&ViewError::RunNotFound) };
+    page(&pages::curves::page(&state.root, &chosen), &WayUp::from_index())
+}
+
+/// Streams the events of the list of all runs, or of the curves of the trainings that the query names.
+async fn index_events(
+    State(state): State<Arc<AppState>>,
+    Extension(peer): Extension<ClientAddress>,
+    uri: Uri,
+) -> Response {
+    match (uri.query(), chosen_trainings(&uri)) {
+        (None, _) => events(&state, Topic::Index, peer),
+        (_, Some(chosen)) => events(&state, Topic::Curves(chosen), peer),
+        (_, None) => error_page(&ViewError::RunNotFound),
+    }
 }
 
 async fn run_events(
@@ -232,6 +247,12 @@ async fn asset(uri: Uri) -> Response {
 /// Returns the path of a run or file, which follows `prefix` in the address.
 fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
     RelativePath::decode(uri.path().strip_prefix(prefix)?)
+}
+
+/// Returns the trainings that a query names, as in `runs=a,b/c`; at most as many as are drawn.
+fn chosen_trainings(uri: &Uri) -> Option<Vec<RelativePath>> {
+    let names = uri.query()?.strip_prefix("runs=")?;
+    names.split(',').take(pages::curves::MAX_TRAININGS).map(RelativePath::decode).collect()
 }
 
 fn page(text: &str, way_up: &WayUp) -> Response {

@@ -17,6 +17,7 @@ use crate::experiment::LiveExperiment;
 use crate::index::Index;
 use crate::keyed_cache::KeyedCache;
 use crate::links::WayUp;
+use crate::pages::curves::ChartedTraining;
 use crate::pages::{self, Update};
 use crate::paths::{RelativePath, Root};
 use crate::report::ReportCache;
@@ -39,6 +40,8 @@ pub(crate) enum Topic {
     Index,
     /// The run in this folder.
     Run(RelativePath),
+    /// The learning curves of these trainings.
+    Curves(Vec<RelativePath>),
 }
 
 /// The data of an event as it is sent to browsers. It is empty before the first load of a page.
@@ -105,7 +108,7 @@ impl Publisher {
         self.runs.remove_idle();
         self.loaders.remove_idle(ViewLoader::is_loading);
         let way_up = match topic {
-            Topic::Index => WayUp::from_index(),
+            Topic::Index | Topic::Curves(_) => WayUp::from_index(),
             Topic::Run(relative) => WayUp::from_run(relative),
         };
         let update = self.update(topic)?.with_relative_links(&way_up);
@@ -121,6 +124,11 @@ impl Publisher {
                 let index = Index::scan(root, &self.runs).map_err(|error| ViewError::Unlisted(error.to_string()))?;
                 let server = self.server.as_ref().map(|server| (server.address(), server.last()));
                 return Ok(pages::index::update(root, &index, server.as_ref()));
+            }
+            Topic::Curves(chosen) => {
+                let found: Vec<_> = chosen.iter().filter_map(|relative| self.charted_training(relative)).collect();
+                let update = pages::curves::update(root, chosen, &found);
+                return if found.is_empty() { Err(ViewError::RunNotFound) } else { Ok(update) };
             }
             Topic::Run(relative) => relative,
         };
@@ -148,9 +156,26 @@ impl Publisher {
                 || LiveAssessment::new(root.path(), &path),
                 |assessment| {
                     assessment.refresh();
-                    pages::assessment::update(root, relative, assessment)
+                    let report = self.reports.fingerprint(&path, assessment.report_fingerprint());
+                    pages::assessment::update(root, relative, assessment, report)
                 },
             ),
+        })
+    }
+
+    /// Returns the training in a folder with its curve. Returns `None` if there is no training.
+    fn charted_training(&self, relative: &RelativePath) -> Option<ChartedTraining> {
+        let path = self.root.resolve(relative)?;
+        let is_training = RunKind::detect(&path) == Some(RunKind::Training);
+        is_training.then(|| {
+            self.runs.trainings.with(
+                &path,
+                || LiveTraining::new(self.root.path(), &path),
+                |training| {
+                    training.refresh_details();
+                    ChartedTraining::new(&self.root, relative, training)
+                },
+            )
         })
     }
 
@@ -192,7 +217,14 @@ impl Publisher {
     /// Drops topics without subscribers. Returns the remaining topics whose last event satisfies `wanted`.
     fn subscribed_topics(&self, wanted: impl Fn(&EventData) -> bool) -> Vec<Topic> {
         let mut topics = self.topics();
-        topics.retain(|_, sender| sender.receiver_count() > 0);
+        topics.retain(|topic, sender| {
+            let has_subscribers = sender.receiver_count() > 0;
+            if !has_subscribers && matches!(topic, Topic::Curves(_)) {
+                // Clients can choose any number of sets of trainings.
+                self.loaders.remove(topic);
+            }
+            has_subscribers
+        });
         topics.iter().filter(|(_, sender)| wanted(&sender.borrow())).map(|(topic, _)| topic.clone()).collect()
     }
 

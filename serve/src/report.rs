@@ -1,5 +1,5 @@
-//! A cache of the experiments' reports. It builds one report at a time, with pauses that leave the processor to
-//! trainings.
+//! A cache of the reports of experiments and assessments. It builds one report at a time, with pauses that leave the
+//! processor to trainings.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -7,6 +7,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use perturb_experiment::Folder;
+use perturb_experiment::runs::RunKind;
 use perturb_report::{ReportBundle, ReportError, ReportInputs};
 use tokio::sync::Semaphore;
 
@@ -29,10 +30,10 @@ const BUILD_TIMEOUT: Duration = Duration::from_secs(120);
 /// Message for requests that have waited too long.
 const STILL_BUILDING: &str = "it is still being built; load this page again in a minute";
 
-/// A function that builds the report of an experiment's folder as HTML. Its error is a text with the reason.
+/// A function that builds the report of a folder as HTML. Its error is a text with the reason.
 type BuildReport = fn(&Path) -> Result<Arc<str>, String>;
 
-/// A cache of reports, by the folders of their experiments.
+/// A cache of reports, by their folders.
 #[derive(Debug)]
 pub(crate) struct ReportCache {
     reports: Mutex<HashMap<PathBuf, CachedReport>>,
@@ -93,7 +94,7 @@ impl ReportCache {
             .map_or(fingerprint, |report| report.fingerprint)
     }
 
-    /// Returns the report of the experiment in `folder` as HTML. Builds it if there is no usable one in the cache.
+    /// Returns the report of the experiment or assessment in `folder` as HTML. Builds it if there is no usable one in the cache.
     /// `fingerprint` is that of the present files.
     ///
     /// # Errors
@@ -164,8 +165,12 @@ impl ReportCache {
 }
 
 fn build(folder: &Path) -> Result<Arc<str>, String> {
-    let sources = ReportInputs { folder: Some(Folder::new(folder)), ..ReportInputs::default() };
-    let page = sources.read(|whole: ReportBundle<'_>| whole.page().map_err(ReportError::from));
+    let mut inputs = ReportInputs::default();
+    match RunKind::detect(folder) {
+        Some(RunKind::Experiment) => inputs.folder = Some(Folder::new(folder)),
+        _ => inputs.add(folder).map_err(|error| error.to_string())?,
+    }
+    let page = inputs.read(|whole: ReportBundle<'_>| whole.page().map_err(ReportError::from));
     page.map(Arc::from).map_err(|error| error.to_string())
 }
 

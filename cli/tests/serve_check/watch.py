@@ -39,7 +39,8 @@ LINES["cells"] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e
 # Of each plot that has a canvas: its name, and how many pixels have a colour of its lines.
 PAINTED = """[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
   const name = canvas.closest('figure').dataset.chart;
-  const lines = LINES[name].map(colour => [1, 3, 5].map(place => parseInt(colour.slice(place, place + 2), 16)));
+  const several = canvas.closest('figure').querySelector('.legend') !== null;
+  const lines = LINES[several ? 'cells' : name].map(colour => [1, 3, 5].map(place => parseInt(colour.slice(place, place + 2), 16)));
   const copy = document.createElement('canvas');
   [copy.width, copy.height] = [canvas.width, canvas.height];
   const context = copy.getContext('2d', {willReadFrequently: true});
@@ -173,6 +174,7 @@ def main():
         pages.check("rows of the list", pages.evaluate("document.querySelectorAll('.runs tbody tr').length"), 3)
         pages.until("the server's answer", "document.getElementById('server').innerText.includes('takes sessions')")
         pages.draw("list")
+        watch_curves(pages)
         pages.open("run/finished")
         loaded = "[...document.images].every(image => image.complete && image.naturalWidth > 0) && document.images.length >= 2"
         pages.evaluate("document.images[0].scrollIntoView()")
@@ -207,6 +209,23 @@ def watch_training(pages):
     pages.evaluate("document.querySelector('input[value=steps]').click()")
     pages.check("over steps it reaches further", pages.evaluate(f"{REACH} > {reach}"), True)
     pages.stayed("a curve that grows")
+
+
+def watch_curves(pages):
+    """Two trainings in the same charts, chosen in the list."""
+    link = "document.getElementById('charted')"
+    pages.check("a link before a choice", pages.evaluate(f"{link}.parentElement.hidden"), True)
+    pages.evaluate("document.querySelectorAll('input[name=charted]').forEach(input => input.click())")
+    pages.check("a link to the chosen", pages.evaluate(f"{link}.parentElement.hidden"), False)
+    path = pages.evaluate(f"{link}.getAttribute('href')").removeprefix("./")
+    pages.open(path)
+    pages.until("both curves", "document.querySelectorAll('[data-chart=return] .legend li').length === 2")
+    points = "Number(document.querySelector('[data-chart=return]').dataset.points)"
+    before = pages.evaluate(points)
+    pages.draw("curves", ["return", "success", "length"])
+    pages.evaluate("document.querySelector('input[value=steps]').click()")
+    pages.check("points over steps", pages.evaluate(f"{points} >= {before}"), True)
+    pages.draw("curves-over-steps", ["return", "success", "length"], schemes=("light",))
 
 
 def watch_experiment(pages, experiment):

@@ -9,7 +9,9 @@ use perturb_experiment::runs::{CellStatus, ExperimentStatus, RunKind};
 use perturb_text::{duration, grouped};
 use serde_json::json;
 
-use super::{ReportSource, Update, badge, bar, breadcrumbs, chart, faults, pictures, run_link, shown_name, time};
+use super::{
+    ReportSource, Update, badge, bar, breadcrumbs, chart, faults, pictures, report_frame, run_link, shown_name, time,
+};
 use crate::experiment::{LiveExperiment, MAX_CURVES as MAX_LISTED};
 use crate::paths::{RelativePath, Root};
 use crate::pictures::scan_run;
@@ -54,7 +56,6 @@ pub(crate) fn update(
 }
 
 pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> String {
-    let report = format!("/report/{}", relative.encode());
     let main = html! {
         h1 { (shown_name(root, relative)) }
         (update.part("head"))
@@ -65,9 +66,7 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
         details open { summary { "All cells" } (update.part("map")) }
         (update.part("pictures"))
         h2 { "Report as it stands" }
-        p.note { a href=(report) { "The report on its own page" } ", as " code { "perturb report --html" } " writes it at the end." }
-        (update.part("lag"))
-        iframe.report src=(report) title="Report as it stands" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
+        (report_frame(relative, update))
         p.note {
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
         }

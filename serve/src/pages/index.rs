@@ -7,7 +7,7 @@ use perturb_experiment::runs::RunKind;
 use perturb_protocol::Address;
 use perturb_text::{duration, grouped};
 
-use super::{Update, badge, bar, facts, pictures, run_link, shown_name, time};
+use super::{Update, badge, bar, curves, facts, pictures, run_link, shown_name, time};
 use crate::index::{Index, MAX_FOLDERS, Row};
 use crate::paths::Root;
 use crate::server_status::ServerStatus;
@@ -38,6 +38,7 @@ pub(crate) fn page(root: &Root, update: &Update) -> String {
     let main = html! {
         h1 { "Trainings and experiments" }
         (update.part("runs"))
+        (curves::chosen_link())
         (update.part("server"))
         (update.part("pictures"))
     };
@@ -88,7 +89,10 @@ fn run(root: &Root, Row { relative, kind, summary, changed, remaining_seconds }:
     let number = |number: u64| grouped(number as usize);
     html! {
         tr role="row" {
-            th scope="row" role="rowheader" { a href=(run_link(relative)) { (name) } }
+            th scope="row" role="rowheader" {
+                @if *kind == RunKind::Training { (curves::choice_box(&name, relative)) }
+                a href=(run_link(relative)) { (name) }
+            }
             td.what role="cell" {
                 (match kind {
                     RunKind::Training => "training",

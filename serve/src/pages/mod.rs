@@ -4,6 +4,7 @@
 //! script replaces the parts that differ. Curves are sent as numbers.
 
 pub(crate) mod assessment;
+pub(crate) mod curves;
 pub(crate) mod experiment;
 pub(crate) mod index;
 pub(crate) mod pictures;
@@ -38,7 +39,7 @@ pub(crate) struct Update {
     pub(crate) charts: Value,
     /// Fingerprint of the report that a request would get now.
     pub(crate) report: u64,
-    /// Files of an experiment's report; `None` for other pages.
+    /// Files of the report of an experiment or an assessment; `None` for other pages.
     pub(crate) report_source: Option<ReportSource>,
     /// Links to the runs whose folders contain this one.
     breadcrumbs: Markup,
@@ -47,7 +48,7 @@ pub(crate) struct Update {
 /// The files from which a report is built.
 #[derive(Clone, Debug)]
 pub(crate) struct ReportSource {
-    /// The experiment's folder, or the reason why there is no report.
+    /// The folder of the experiment or assessment, or the reason why there is no report.
     pub(crate) folder: Result<PathBuf, String>,
     /// A number that changes with the files.
     pub(crate) fingerprint: u64,
@@ -220,6 +221,27 @@ fn chart(name: &str, title: &str) -> Markup {
         figure.chart data-chart=(name) {
             figcaption { (title) }
             div.plot role="img" aria-label=(title) {}
+        }
+    }
+}
+
+/// Returns the report of a run in a frame, and its part `lag`.
+fn report_frame(relative: &RelativePath, update: &Update) -> Markup {
+    let report = format!("/report/{}", relative.encode());
+    html! {
+        p.note { a href=(report) { "The report on its own page" } ", as " code { "perturb report --html" } " writes it." }
+        (update.part("lag"))
+        iframe.report src=(report) title="Report" loading="lazy" data-report=(format!("{:016x}", update.report)) {}
+    }
+}
+
+/// Returns the choice of the horizontal axis of learning curves.
+fn budget_choice() -> Markup {
+    html! {
+        fieldset.choice {
+            legend { "Over" }
+            label { input type="radio" name="over" value="episodes" checked; " episodes" }
+            label { input type="radio" name="over" value="steps"; " environment steps" }
         }
     }
 }

@@ -9,7 +9,7 @@ use perturb_records::TestResult;
 use perturb_text::{duration, grouped, shortened};
 use serde_json::json;
 
-use super::{Update, badge, bar, breadcrumbs, chart, facts, faults, pictures, shown_name, time};
+use super::{Update, badge, bar, breadcrumbs, budget_choice, chart, facts, faults, pictures, shown_name, time};
 use crate::curve::LearningCurve;
 use crate::paths::{RelativePath, Root};
 use crate::pictures::scan_run;
@@ -56,11 +56,7 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
         (update.part("troubles"))
         (update.part("figures"))
         h2 { "Learning curve" }
-        fieldset.choice {
-            legend { "Over" }
-            label { input type="radio" name="over" value="episodes" checked; " episodes" }
-            label { input type="radio" name="over" value="steps"; " environment steps" }
-        }
+        (budget_choice())
         div.charts {
             (chart("return", "Return"))
             (chart("success", "Success, %"))

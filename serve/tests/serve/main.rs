@@ -2,5 +2,7 @@
 #![allow(clippy::unwrap_used)]
 
 mod client;
+#[path = "../../../crates/records/src/fixture.rs"]
+mod fixture;
 mod pages;
 mod safety;

@@ -2,6 +2,7 @@
 
 use perturb_experiment::{Folder, Plan};
 use perturb_files::Lock;
+use perturb_protocol::Version;
 
 use crate::client::{Place, lines, write, write_training};
 
@@ -54,6 +55,42 @@ fn a_training_page_has_curve_figures_and_settings() {
 }
 
 #[test]
+fn several_trainings_are_drawn_in_one_chart() {
+    let place = Place::new();
+    write_training(&place.path("more/two, or <b>"), 60);
+    let index =
+        place.until("/", |page| page.body.contains("training: CartPole D a2c ff") && page.body.contains("more/two"));
+    let two = "more/two%2C%20or%20%3Cb%3E";
+    for words in ["value=\"one\"", &format!("value=\"{two}\""), "id=\"charted\" href=\"./curves\""] {
+        assert!(index.body.contains(words), "{words} is not in {}", index.body);
+    }
+    assert!(!index.body.contains("value=\"study\""), "an experiment has no curve of its own");
+    let page = place.get(&format!("/curves?runs=one,{two}"));
+    assert_eq!(page.status, 200);
+    for words in [&format!("data-events=\"./events?runs=one,{two}\""), "data-chart=\"return\"", "value=\"steps\""] {
+        assert!(page.body.contains(words), "{words} is not in {}", page.body);
+    }
+    let mut events = place.events(&format!("/events?runs=one,{two},study"));
+    let event =
+        events.until("both curves", |event| event["charts"]["runs"].as_array().is_some_and(|runs| runs.len() == 2));
+    let runs = &event["charts"]["runs"];
+    assert_eq!((&runs[0]["id"], &runs[1]["kind"]), (&"one".into(), &"more/two, or <b>".into()));
+    assert_eq!(runs[0]["return"], serde_json::json!([4.5, 14.5, 24.5]));
+    assert_eq!((runs[0]["steps"][2].as_f64(), runs[1]["success"].as_array().unwrap().len()), (Some(100.0), 6));
+    let head = part(&event, "head");
+    for words in ["href=\"./run/one\"", "two, or &lt;b&gt;</a>: CartPole D a2c ff", "There is no training study."] {
+        assert!(head.contains(words), "{words} is not in {head}");
+    }
+    write_training(&place.path("one"), 50);
+    events.until("a curve that grew", |event| event["charts"]["runs"][0]["return"].as_array().unwrap().len() == 5);
+    let gone = place.events("/events?runs=none,study").until("an answer", |_| true);
+    assert!(gone["gone"].as_str().unwrap().contains("no run here"), "{gone}");
+    for path in ["/curves", "/curves?runs=../one", "/events?runs=..", "/events?other"] {
+        assert_eq!(place.get(path).status, 404, "{path}");
+    }
+}
+
+#[test]
 fn an_experiment_page_has_cells_rates_and_report() {
     let place = Place::new();
     let page = place.get("/run/study");
@@ -75,6 +112,26 @@ fn an_experiment_page_has_cells_rates_and_report() {
     write_training(&cell, 20);
     let page = place.get(&format!("/run/study/cells/{}/training", plan.cells[0].id));
     assert!(page.body.contains("90.0 … 92.0") && page.body.contains("href=\"../../../../run/study\""), "{}", page.body);
+}
+
+#[test]
+fn an_assessment_page_has_the_report_of_its_agent() {
+    let place = Place::new();
+    let agent = crate::fixture::assessed("mine <b>", "CartPole", &[Some(Version::R)], [200, 190, 100]);
+    agent.write(&place.path("saved"), false).unwrap();
+    let page = place.get("/run/saved");
+    assert_eq!(page.status, 200);
+    for words in ["mine &lt;b&gt;", "CartPole", "src=\"../report/saved\""] {
+        assert!(page.body.contains(words), "{words} is not in {}", page.body);
+    }
+    let report = place.get("/report/saved");
+    assert!(report.status == 200 && report.body.contains("mine &lt;b&gt; (trained elsewhere)"), "{}", report.body);
+    let mut events = place.events("/events/saved");
+    let before = events.until("the page", |event| event["parts"]["head"].is_string())["report"].clone();
+    write(&place.path("saved/assessment.json"), "{");
+    events.until("the fault", |event| part(event, "head").contains("not understood"));
+    events.until("another report", |event| event["report"] != before);
+    place.until("/report/saved", |page| page.body.contains("this assessment is not understood"));
 }
 
 #[test]

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Serialize, Serializer};
 
-pub use self::assessment::{AssessedTest, AssessmentStatus};
+pub use self::assessment::AssessmentStatus;
 pub use self::experiment::{CellStatus, ExperimentStatus, LEADS_OUT};
 pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;

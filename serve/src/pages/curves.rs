@@ -1,0 +1,95 @@
+//! The page with the learning curves of several trainings in the same charts.
+
+use maud::{Markup, html};
+use serde::Serialize;
+use serde_json::json;
+
+use super::{Update, badge, budget_choice, chart, faults, run_link, shown_name};
+use crate::curve::LearningCurve;
+use crate::paths::{RelativePath, Root};
+use crate::training::LiveTraining;
+
+/// Maximum number of trainings in a chart: the number of colours.
+pub(crate) const MAX_TRAININGS: usize = 8;
+
+/// A training in the charts.
+#[derive(Debug, Serialize)]
+pub(crate) struct ChartedTraining {
+    #[serde(skip)]
+    relative: RelativePath,
+    /// The shown name, which is also the kind by which the script chooses colours.
+    id: String,
+    kind: String,
+    #[serde(skip)]
+    what: String,
+    #[serde(skip)]
+    state: &'static str,
+    #[serde(flatten)]
+    curve: LearningCurve,
+}
+
+impl ChartedTraining {
+    pub(crate) fn new(root: &Root, relative: &RelativePath, training: &LiveTraining) -> Self {
+        let name = shown_name(root, relative);
+        let summary = training.summary();
+        Self {
+            relative: relative.clone(),
+            id: name.clone(),
+            kind: name,
+            what: summary.what,
+            state: summary.state,
+            curve: training.curve(),
+        }
+    }
+}
+
+/// Returns the content for the `chosen` trainings, of which `found` exist.
+pub(crate) fn update(root: &Root, chosen: &[RelativePath], found: &[ChartedTraining]) -> Update {
+    let missing = chosen.iter().filter(|relative| found.iter().all(|one| one.relative != **relative));
+    let missing: Vec<String> =
+        missing.map(|relative| format!("There is no training {}.", shown_name(root, relative))).collect();
+    let head = html! {
+        ul {
+            @for one in found {
+                li { a href=(run_link(&one.relative)) { (one.id) } ": " (one.what) " " (badge(one.state)) }
+            }
+        }
+        (faults(&missing))
+    };
+    Update {
+        title: format!("{} trainings · perturb", found.len()),
+        parts: vec![("head", head)],
+        charts: json!({ "runs": found }),
+        ..Update::default()
+    }
+}
+
+/// Returns the page, whose parts and curves come with its events.
+pub(crate) fn page(root: &Root, chosen: &[RelativePath]) -> String {
+    let title = "Learning curves of several trainings";
+    let breadcrumbs = html! {
+        ol { li { a href="/" { (root.given().display()) } } li { span aria-current="page" { (title) } } }
+    };
+    let main = html! {
+        h1 { (title) }
+        (Update::default().part("head"))
+        (budget_choice())
+        div.charts {
+            (chart("return", "Return"))
+            (chart("success", "Success, %"))
+            (chart("length", "Episode length, steps"))
+        }
+    };
+    let names: Vec<String> = chosen.iter().map(RelativePath::encode).collect();
+    super::document(title, &format!("/events?runs={}", names.join(",")), &breadcrumbs, &main)
+}
+
+/// Returns the box that chooses a training in the list of all runs.
+pub(super) fn choice_box(name: &str, relative: &RelativePath) -> Markup {
+    html! { input type="checkbox" name="charted" value=(relative.encode()) aria-label={ "Draw " (name) } title="Draw with others"; " " }
+}
+
+/// Returns the link to the chosen trainings, which the script shows and completes.
+pub(super) fn chosen_link() -> Markup {
+    html! { p hidden { a #charted href="/curves" data-most=(MAX_TRAININGS) {} } }
+}
