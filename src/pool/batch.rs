@@ -221,8 +221,8 @@ impl Batch {
         self.runner.as_deref()
     }
 
-    /// Frees the environments in `slots`, which must be in order. At least one environment must remain. The remaining
-    /// environments are renumbered from slot 0, and unchanged otherwise.
+    /// Frees the environments in `slots`, which must be sorted in ascending order. At least one environment must
+    /// remain. The remaining environments are renumbered from slot 0, and unchanged otherwise.
     ///
     /// # Errors
     /// [`Error::Defect`], if a worker panicked.
@@ -255,8 +255,8 @@ impl Batch {
         Ok(())
     }
 
-    /// Begins new episodes in some environments. `entries` must be in order of slots. Returns the first observations of
-    /// the M episodes, f32 `[M, O]`, and, if the settings have receipts, the episodes that began.
+    /// Begins new episodes in some environments. `entries` must be sorted by slot, ascending. Returns the first
+    /// observations of the M episodes, f32 `[M, O]`, and, if the settings have receipts, the episodes that began.
     ///
     /// # Errors
     /// [`Error::Defect`], if a worker panicked.
@@ -281,7 +281,7 @@ impl Batch {
         Ok((self.observations(&slots), collect(&self.job.shards, |shard| &mut shard.started)))
     }
 
-    /// Returns a snapshot of each environment in `slots`, which must be in order.
+    /// Returns a snapshot of each environment in `slots`, which must be sorted in ascending order.
     ///
     /// # Errors
     /// [`Error::Defect`], if a worker panicked.
@@ -293,8 +293,9 @@ impl Batch {
         Ok(collect(&self.job.shards, |shard| &mut shard.snapshots).into_iter().map(Bytes::from).collect())
     }
 
-    /// Restores the environments in some slots from snapshots. `entries` must be in order of slots. If one cannot be
-    /// restored, none is changed. Returns the observations of the M restored environments, f32 `[M, O]`.
+    /// Restores the environments in some slots from snapshots. `entries` must be sorted by slot, ascending. If an
+    /// environment cannot be restored, none is changed. Returns the observations of the M restored environments,
+    /// f32 `[M, O]`.
     ///
     /// # Errors
     /// [`Error::Environment`] if a snapshot cannot be restored, [`Error::Defect`] if a worker panicked.
@@ -321,7 +322,7 @@ impl Batch {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
 
-    /// Returns the address of the current episode in a slot: seed, environment index and episode index.
+    /// Returns the seed, environment index and episode index of the current episode in a slot.
     pub fn draw(&self, slot: usize) -> Draw {
         lock(&self.job.shards[slot / self.shard_size]).draw(slot)
     }
@@ -482,7 +483,7 @@ impl Drop for Batch {
     }
 }
 
-/// Returns the addresses of the current episodes of a job's environments, in order of slots.
+/// Returns the seed, environment index and episode index of the current episode in each slot of a job.
 fn draws(job: &Job) -> Vec<Draw> {
     job.shards.iter().flat_map(|shard| lock(shard).draws().collect::<Vec<_>>()).collect()
 }

@@ -10,7 +10,7 @@ pub(super) fn push_f32(buffer: &mut BytesMut, values: &[f32]) {
     words.iter_mut().zip(values).for_each(|(to, from)| *to = from.to_le_bytes());
 }
 
-/// Appends numbers of 64 bits, as `encode` converts each to bytes.
+/// Appends 64-bit numbers. `encode` converts each number to its 8 bytes.
 pub(super) fn push_wide<T: Copy>(buffer: &mut BytesMut, values: &[T], encode: impl Fn(T) -> [u8; 8]) {
     let start = buffer.len();
     buffer.resize(start + 8 * values.len(), 0);

@@ -37,7 +37,8 @@ pub struct StepResult {
     pub receipt_values: Bytes,
 }
 
-/// The shards whose outputs are gathered. The arrays are split off from `buffer`, whose memory is reused.
+/// Gathers the outputs of a batch's shards into arrays for a reply. Each array is written to `buffer` and then split
+/// off from it, so later results can reuse the buffer's memory.
 pub(super) struct ShardOutputs<'a> {
     pub(super) shards: &'a [Mutex<Shard>],
     pub(super) buffer: &'a mut BytesMut,

@@ -1,4 +1,5 @@
-//! A rollout: the steps of one reply to the request `act`. A policy plays them on the workers, without the session.
+//! Rollouts: a request `act` makes the workers step the environments with a policy's actions, without the session. The
+//! reply contains the steps of one rollout.
 //!
 //! The worker that runs the last shard of a step gathers the outputs, chooses the next actions and gives them to the
 //! shards. Then the job goes to the back of the queue, as after any other step. The session is woken at the end of the
@@ -64,7 +65,8 @@ pub struct Rollout {
     pub truncated: BytesMut,
     /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`.
     pub truncation_values: BytesMut,
-    /// The episodes that ended and count for the policy's task, in order of steps, then of slots.
+    /// The episodes that ended, ordered by step, then by slot. If the task is a number of episodes per environment,
+    /// later episodes of an environment are left out.
     pub ended: Vec<EndedAt>,
     /// Whether the policy's task was finished in this rollout.
     pub finished: bool,
