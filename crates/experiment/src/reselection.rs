@@ -24,9 +24,10 @@ use crate::folder::{CellResult, CellState};
 use crate::plan::{Cell, SELECTION_TEST, Selection};
 use crate::selection::{MethodResults, Results, Selected, common_runs};
 
-/// The seed for drawing runs. It is also the seed of the interval without selection.
+/// The seed for drawing runs. The ordinary bootstrap, which does not repeat selections, has the same seed.
 const RUNS_SEED: u64 = 1;
-/// The seed for repeating selections. It is separate, so that the same runs are drawn with and without selection.
+/// The seed for repeating selections. It is separate from `RUNS_SEED`, so that this bootstrap draws the same runs as
+/// the ordinary one.
 const SELECTION_SEED: u64 = 2;
 
 /// A bootstrap over the results of a plan that repeats all selections in each resample.
@@ -87,8 +88,9 @@ impl<'a> SelectionBootstrap<'a> {
     /// Repeats every selection in each resample; otherwise works like
     /// [`bootstrap`](perturb_records::statistics::bootstrap).
     ///
-    /// `statistic` gets the scores of `metric`, %: a list for each of `selections`, with one score for each run that
-    /// all of them have. Returns `None` if there is no such run. There are no intervals if there are too few runs.
+    /// `statistic` gets a list of scores of `metric`, %, for each of `selections`. A list has one score for each run
+    /// that all of `selections` have. Returns `None` if there is no such run. There are no intervals if there are too
+    /// few runs.
     pub fn bootstrap(
         &self,
         selections: &[&MethodResults<'a>],
@@ -121,8 +123,8 @@ impl<'a> SelectionBootstrap<'a> {
         Some(points.into_iter().zip(estimates).map(with_interval).collect())
     }
 
-    /// Returns the selections that the reported policies are from, and for each of `selections` its reported runs. Only
-    /// runs that all selections have are included.
+    /// Returns the candidates of each selection that chose a reported policy, and a list of reported runs for each of
+    /// `selections`. Includes only runs that all of `selections` have.
     fn reported(
         &self,
         selections: &[&MethodResults<'a>],
@@ -224,7 +226,8 @@ impl SelectionTest {
 }
 
 impl DrawnPolicy<'_> {
-    /// Returns the metric of this run, %, as if `winners` had been selected. `winners` is indexed like the selections.
+    /// Returns the metric of this run, %, as if `winners` had been selected. `winners` has one element for each
+    /// selection; `selected` contains indices of this list.
     /// Returns the reported score if a needed test is missing.
     fn score_of(
         &self,

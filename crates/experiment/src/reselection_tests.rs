@@ -26,7 +26,8 @@ fn is_a(cell: &Cell) -> bool {
     cell.config.table()["learning_rate"].as_float() == Some(7e-3)
 }
 
-/// Returns two intervals of a metric's interquartile mean: from a bootstrap without and with repeated selection.
+/// Returns two confidence intervals of a metric's interquartile mean. The first is from an ordinary bootstrap, the
+/// second from a bootstrap that repeats the selection of configurations in each resample.
 fn intervals(results: &Results<'_>, metric: Metric) -> [[f64; 2]; 2] {
     let selections = results.select();
     let both: Vec<_> = selections.iter().collect();

@@ -6,8 +6,9 @@
 //! configuration with the highest success rate on its training version. Ties go to the higher mean return in the same
 //! test. If configurations still tie, the rule cannot choose among them, so reported numbers are means over all of
 //! them. `selected.csv` and heatmaps need a single cell, and use the first tied one in the plan's order. The first
-//! configuration is also selected if the training version was not tested. As in the paper, the test that selects is
-//! also reported. With a large grid, this makes Default and Interpolation a little too high.
+//! configuration is also selected if the training version was not tested. As in the paper, the result of the test by
+//! which a configuration is selected is also reported. With a large grid, this makes Default and Interpolation a little
+//! too high.
 
 use std::collections::BTreeMap;
 
@@ -133,7 +134,8 @@ impl<'a> Results<'a> {
         })
     }
 
-    /// Returns the state of all selections among tuning cells, see [`tuned`](crate::tuned).
+    /// Returns the progress and the result of the selection among tuning cells, for each environment, method and
+    /// training distribution. See [`tuned`](crate::tuned).
     pub fn tuned(&self) -> Vec<Tuned<'_>> {
         tuned(self.plan, &self.states)
     }
@@ -330,13 +332,13 @@ impl<'a> Selected<'a> {
         Some(self.test(&version.to_string())?.success_percent)
     }
 
-    /// Returns the test that selects by the paper's rule: the test on the training distribution.
+    /// Returns the test on the training distribution. The paper's rule selects cells by this test.
     fn own_test(&self) -> Option<&'a TestResult> {
         self.test(&self.cell.trained_on().to_string())
     }
 
-    /// Returns success rate (%) and mean return in the test that selects. The cell with the highest rank is selected.
-    /// Cells without this test have rank `None`.
+    /// Returns the cell's rank for the paper's rule, which selects the cell with the highest rank: the success rate (%)
+    /// and the mean return in the test on the training distribution. Returns `None` if the cell has no such test.
     fn rank(&self) -> Option<(f64, f64)> {
         self.own_test().map(|test| (test.success_percent, test.mean_return))
     }
@@ -368,15 +370,15 @@ pub fn interquartile(selections: &[&MethodResults<'_>], metric: Metric, resample
     Bootstrapped::new(&scores(selections, metric), resamples, 1, interquartile_mean)
 }
 
-/// Returns the values of a metric, %: for each of `selections` a list, with one value for each run that all of them
-/// have.
+/// Returns a list of a metric's values, %, for each of `selections`. A list has one value for each run that all of
+/// `selections` have.
 pub fn scores(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<Vec<f64>> {
     let runs = common_runs(selections, metric);
     (0..selections.len()).map(|i| runs.iter().map(|(_, numbers)| numbers[i]).collect()).collect()
 }
 
-/// Returns the runs that all `selections` have: the run's number, and its value of the metric, %, in each of
-/// `selections`.
+/// Returns the runs that all `selections` have. A run is returned as its number and a list of the metric's values, %,
+/// one for each of `selections`.
 pub(crate) fn common_runs(selections: &[&MethodResults<'_>], metric: Metric) -> Vec<(u32, Vec<f64>)> {
     let by_environment: Vec<BTreeMap<u32, f64>> = selections.iter().map(|selection| selection.metric(metric)).collect();
     let of_run = |run: &u32| {

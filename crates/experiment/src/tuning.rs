@@ -57,7 +57,8 @@ impl Tuned<'_> {
     }
 }
 
-/// Returns the state of each selection of `plan`, in the plan's order. `states` are the states of the plan's cells.
+/// Returns the progress and the result of the selection among tuning cells, for each environment, method and training
+/// distribution in the plan's order. `states` are the states of the plan's cells.
 pub fn tuned<'a>(plan: &'a Plan, states: &'a [CellState]) -> Vec<Tuned<'a>> {
     let mut groups: Vec<(Tuned<'a>, Vec<Vec<Candidate<'a>>>)> = Vec::new();
     let mut places = HashMap::new();

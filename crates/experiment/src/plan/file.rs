@@ -47,7 +47,8 @@ pub(super) struct File {
     /// Only with `selection = "clean"`: number of tuning seeds, starting at `seed` (default: `1`). Trainings with
     /// tuning seeds only serve the selection.
     tuning_runs: Option<u32>,
-    /// Only with `selection = "clean"`: episodes of each test that selects a configuration (default: `test_episodes`).
+    /// Only with `selection = "clean"`: episodes of each test by which configurations are selected (default:
+    /// `test_episodes`).
     selection_episodes: Option<u64>,
     /// Number of repetitions of the whole experiment with different seeds, at least 1 (default: `1`).
     #[serde(default = "one")]
@@ -233,14 +234,14 @@ impl File {
         Some(given.cloned().unwrap_or(usual)).filter(|rule| *rule != Rule::Text)
     }
 
-    /// Returns the number of tuning runs: their tests only select a configuration, and are not reported. 0 unless
-    /// `selection` is "clean".
+    /// Returns the number of tuning runs. Their tests serve only to select configurations, and are not reported. The
+    /// number is 0 unless `selection` is "clean".
     pub(super) fn tuning_runs(&self) -> u32 {
         if self.selection == Selection::Clean { self.tuning_runs.unwrap_or(1) } else { 0 }
     }
 
-    /// Returns the number of episodes of the separate test that selects configurations. Returns `None` if the reported
-    /// tests select them.
+    /// Returns the number of episodes of the separate test by which configurations are selected. Returns `None` if they
+    /// are selected by the reported tests.
     pub(super) fn selection_episodes(&self) -> Option<u64> {
         (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
     }

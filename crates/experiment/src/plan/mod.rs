@@ -2,8 +2,10 @@
 //!
 //! A cell is one training and its tests. An experiment file has a cell for every combination of environment, algorithm,
 //! architecture, point of the grid, training version and run. The last of these varies fastest. All cells of a run have
-//! the same seed, so that they differ only in what the file varies. With `selection = "clean"`, these cells are tuning
-//! cells: they only select configurations, which are then trained again with other seeds.
+//! the same seed, so that they differ only in what the file varies.
+//!
+//! With `selection = "clean"`, all these combinations are tuning cells: their tests serve only to select
+//! configurations. Further cells then train the selected configurations again, with other seeds.
 
 mod expansion;
 mod file;
@@ -48,7 +50,8 @@ pub struct Plan {
     pub selection: Selection,
     /// Number of reported runs: repetitions with different seeds.
     pub runs: u32,
-    /// Number of tuning runs, which have separate seeds and only select configurations; 0 if the reported tests select.
+    /// Number of tuning runs, which have separate seeds and serve only to select configurations. 0 if configurations
+    /// are selected by the reported tests.
     pub tuning_runs: u32,
     /// The cells to run. With `selection = "clean"` these are the tuning cells, until [`Plan::with_selected_cells`]
     /// appends the selected ones. A cell's index is its position in this list.
@@ -61,7 +64,8 @@ pub struct Plan {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Selection {
-    /// The paper's rule: the tests that are reported also select. This biases the reported results upwards.
+    /// The paper's rule: configurations are selected by the tests that are also reported. This biases the reported
+    /// results upwards.
     #[default]
     Paper,
     /// Configurations are selected by separate test episodes, in trainings with tuning seeds. The selected
@@ -102,8 +106,8 @@ pub struct Cell {
     pub configuration: String,
     /// The number of the run, from 1. Tuning runs are numbered separately.
     pub run: u32,
-    /// For a cell that is trained after the selection: the [`configuration`](Cell::configuration) of the tuning cells
-    /// that select it. `None` for all other cells.
+    /// For a cell that trains a selected configuration again: the [`configuration`](Cell::configuration) of the tuning
+    /// cells by which it was selected. `None` for all other cells.
     pub tuned_as: Option<String>,
     /// The name of the plan's parameter set that the policy is trained on; `None` if it is trained on a version.
     pub set: Option<String>,

@@ -30,7 +30,7 @@ pub struct RunFolder {
     pub kind: RunKind,
 }
 
-/// A kind of run. Its folder has its own layout.
+/// A kind of run. Folders of different kinds have different layouts.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub enum RunKind {
     /// A training, as `perturb train --out` writes it.

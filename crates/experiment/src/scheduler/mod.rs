@@ -30,17 +30,19 @@ use running::Running;
 pub use running::RunningGroup;
 use slurm::SlurmError;
 
-/// Maximum number of attempts at a cell that end in a row without progress.
+/// Maximum number of successive attempts at a cell that end without progress.
 pub const MAX_ATTEMPTS: u32 = 3;
-/// Number of file faults in a row, over some fifteen seconds, after which the run ends.
+/// Number of successive attempts at a cell that end with [`CellEvent::FileFault`], after which the run ends. With the
+/// pauses between attempts, this takes some fifteen seconds.
 const MAX_FAULTS: u32 = 5;
 /// Minimum time that a cell waits for a lost server before the run ends, because a server may be restarting.
 const MIN_SERVER_WAIT: Duration = Duration::from_secs(15);
 /// Time on a server after which the count of successive losses is reset at the next loss.
 const STABLE_CONNECTION: Duration = Duration::from_secs(60);
-/// Pause after the first lost server or file fault. It doubles with every further one in a row.
+/// Pause after an attempt that lost its server or could not read or write a file. The pause doubles with each further
+/// attempt that ends in the same way.
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
-/// Maximum pause after a lost server or a file fault.
+/// Maximum pause after an attempt that lost its server or could not read or write a file.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
 /// Interval between reads of the folder, and between progress messages.
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
@@ -241,7 +243,7 @@ struct Tracked {
     alone: bool,
     /// A failure recorded before this run, which this run retries. Any later failure makes the cell failed.
     retryable: Option<FailureId>,
-    /// Number of attempts in a row that ended without progress.
+    /// Number of successive attempts that ended without progress.
     attempts: u32,
     /// Number of training steps in the last checkpoint.
     saved: u64,
@@ -250,11 +252,11 @@ struct Tracked {
     /// The progress of the current attempt.
     progress: TrainingProgress,
     lost_servers: usize,
-    /// Number of lost servers in a row.
+    /// Number of successive attempts that lost their server.
     lost_in_a_row: u32,
-    /// Time spent waiting after these losses.
+    /// Time spent waiting after these attempts.
     waited: Duration,
-    /// Number of file faults in a row.
+    /// Number of successive attempts that could not read or write a file, without a new checkpoint in between.
     faults_in_a_row: u32,
     /// The time of the first event of the current attempt. Time in a cluster's queue therefore does not count.
     begun: Option<Instant>,
@@ -387,7 +389,7 @@ impl<'a> Scheduler<'a> {
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
             CellEvent::LostServer { .. } => {
-                // A connection that lasted starts a new count of losses in a row.
+                // After a connection that lasted, successive losses are counted anew.
                 if tracked.served.is_some_and(|since| now - since >= STABLE_CONNECTION) {
                     (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
@@ -406,7 +408,7 @@ impl<'a> Scheduler<'a> {
                 self.pause(cell, now + pause);
             }
             CellEvent::FileFault { .. } => {
-                // A checkpoint since the last fault starts a new count of faults in a row.
+                // If this attempt saved a checkpoint, successive faults are counted anew.
                 if tracked.saved_before.is_some_and(|before| tracked.saved > before) {
                     tracked.faults_in_a_row = 0;
                 }
@@ -607,7 +609,8 @@ impl<'a> Scheduler<'a> {
     }
 }
 
-/// Returns the pause after `in_a_row` lost servers or file faults in a row.
+/// Returns the pause after `in_a_row` successive attempts that all lost their server, or all could not read or write a
+/// file.
 fn pause(in_a_row: u32) -> Duration {
     MAX_PAUSE.min(FIRST_PAUSE * (1 << (in_a_row - 1).min(16)))
 }

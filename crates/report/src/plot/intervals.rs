@@ -31,7 +31,8 @@ pub struct IntervalPlot {
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) groups: Vec<Group>,
-    /// The legend's texts for a number, for its interval and for the second number. Unused texts may be empty.
+    /// The texts of the legend: what the number of a row is, what its interval is, and what the row's second number is
+    /// (see [`IntervalRow::other`]). The text for a symbol that no row has may be empty.
     pub(crate) legend: [String; 3],
     /// The note below all groups.
     pub(crate) note: String,
@@ -52,7 +53,7 @@ pub(crate) struct IntervalRow {
     pub(crate) index: usize,
     pub(crate) point: Option<f64>,
     pub(crate) interval: Option<[f64; 2]>,
-    /// The second number, for comparison, for example the paper's.
+    /// A second number, drawn for comparison with `point`: for example, the result in the paper.
     pub(crate) other: Option<f64>,
 }
 
@@ -127,7 +128,8 @@ impl IntervalPlot {
         Frame { left, top, width, height, x: self.x.clone(), y: 0.0..0.0 }
     }
 
-    /// Draws a row at the height `y`: the interval, the number and the second number. A missing number becomes a text.
+    /// Draws a row at the height `y`: its interval, its number and its second number. If the number is missing, writes
+    /// "missing" at an end of the row.
     fn draw_row<DB: DrawingBackend>(
         &self,
         canvas: &PlotCanvas<'_, DB>,
@@ -159,7 +161,8 @@ impl IntervalPlot {
         entries.map(|(which, text)| (which, text.as_str())).collect()
     }
 
-    /// Draws a legend entry: 0 is a number, 1 an interval, 2 the second number.
+    /// Draws a symbol of the legend with its text. The symbol `which` is that of a number (0), of an interval (1) or of
+    /// a second number (2).
     fn draw_entry<DB: DrawingBackend>(
         &self,
         canvas: &PlotCanvas<'_, DB>,

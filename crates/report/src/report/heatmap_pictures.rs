@@ -43,7 +43,7 @@ struct Draft<'a> {
 /// The policies of a picture with the same training distribution, and the mean of their heatmaps.
 struct PictureColumn<'a> {
     trained_on: TrainedOn<'a>,
-    /// Number of policies, with and without a heatmap.
+    /// Number of policies, including those without a heatmap.
     policies: usize,
     origins: Vec<Origin>,
     missing: Vec<(u32, NoHeatmap)>,

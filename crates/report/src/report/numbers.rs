@@ -14,7 +14,8 @@ use super::index::{ReportIndex, has_scenarios};
 
 /// Number of bootstrap resamples. It is the default of the Python package rliable.
 const RESAMPLES: usize = 50_000;
-/// Number of bootstrap resamples that repeat the selection. Such a resample takes hundreds of times longer.
+/// Number of resamples of the bootstrap that repeats the selection of configurations. One such resample takes hundreds
+/// of times longer than an ordinary one.
 const N_BOOTSTRAP_SELECTION: usize = 10_000;
 /// The best possible success rate, %. The optimality gap is measured from it.
 const MAX_SUCCESS: f64 = 100.0;

@@ -240,7 +240,7 @@ impl StudySource {
     }
 }
 
-/// Returns the plan with the selection rule `rule`, or else its own, and with the cells that the selection adds.
+/// Returns the plan with the cells that its selection adds. If `rule` is given, it replaces the plan's selection rule.
 fn selected_plan(plan: Plan, states: Option<&dyn CellStates>, rule: Option<Selection>) -> Result<Plan, ReportError> {
     let Some(states) = states else { return Ok(plan) };
     let rule = rule.unwrap_or(plan.selection);
