@@ -55,7 +55,7 @@ pub enum Error {
     #[error("a minibatch is empty, but must have at least 1 sample")]
     NoSamples,
     /// The operating system could not start the threads.
-    #[error("{wanted} threads cannot be started: {reason}; ask for fewer")]
+    #[error("{wanted} threads cannot be started: {reason}; use fewer threads")]
     Threads {
         /// Number of threads that were requested.
         wanted: usize,

@@ -89,7 +89,8 @@ impl StudyEpisodes {
                 (Some(was), Some(is)) if was == is => {}
                 (Some(was), Some(is)) => return was.difference(is),
                 (was, _) => {
-                    let longer = if was.is_some() { "the record has more episodes" } else { "the record ends before" };
+                    let longer =
+                        if was.is_some() { "the record has more episodes" } else { "the record has fewer episodes" };
                     return Some(format!("{set}: {longer}"));
                 }
             }

@@ -105,7 +105,7 @@ pub enum ExternalEvaluationError {
     #[error(transparent)]
     Records(#[from] RecordsError),
     /// The folder does not contain an `assessment.json`.
-    #[error("{} holds no assessment: it has no {ASSESSMENT}; give a folder of Assessment.save", path.display())]
+    #[error("{} holds no assessment: it has no {ASSESSMENT}; give a folder that Assessment.save wrote", path.display())]
     Missing { path: PathBuf },
     /// `assessment.json` is damaged, or was written by an incompatible program.
     #[error("{} is damaged: {reason}", path.display())]

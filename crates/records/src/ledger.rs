@@ -229,11 +229,11 @@ impl Ledgers {
         address.ends.push(end);
         // If no environment was in use, this end belongs to the environments that ended last: they had continued to
         // draw.
-        let went_on = address.open.is_empty();
+        let continued = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
         }
-        if !went_on {
+        if !continued {
             address.closed = std::mem::take(&mut address.open);
         }
         let ends = std::mem::take(&mut address.ends);
@@ -244,7 +244,7 @@ impl Ledgers {
             .unwrap_or(LastDraw::None);
         for &which in &address.closed {
             let drawn = &mut self.drawn[which];
-            drawn.last = if went_on { drawn.last.max(last) } else { last };
+            drawn.last = if continued { drawn.last.max(last) } else { last };
             drawn.ended = Some(end.1);
         }
     }
@@ -294,9 +294,9 @@ impl Ledgers {
             let set = &test.set.name;
             let others = tested(environment, test, &claimed);
             let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
-            let mut said: Option<Moment> = None;
+            let mut reported: Option<Moment> = None;
             for drawn in self.drawn.iter().filter(|drawn| drawn.last != LastDraw::None && is_its(&drawn.line)) {
-                let what = if said == Some(drawn.line.at) {
+                let what = if reported == Some(drawn.line.at) {
                     continue;
                 } else if drawn.has_episode(test, records) {
                     format!("episodes of the test on {set}")
@@ -307,7 +307,7 @@ impl Ledgers {
                 };
                 let what = format!("{what} had been drawn before the training ended");
                 proof.against.push(self.sentence(&drawn.line, &what));
-                said = Some(drawn.line.at);
+                reported = Some(drawn.line.at);
             }
         }
         let refused = self.refused.iter().filter(|refused| is_its(&refused.line));

@@ -228,7 +228,7 @@ impl ParquetFile {
                 Some(field) if field.name() == name => {
                     return Err(format!("the column {name} is of another type").into());
                 }
-                _ => return Err(format!("no column {name} in its place").into()),
+                _ => return Err(format!("the column {name} is missing or not in its position").into()),
             }
         }
         Ok(())
@@ -289,7 +289,7 @@ impl RowGroup<'_> {
     /// Reads column number `place`, in which every row must have a value.
     fn all<T: DataType>(&self, place: usize) -> Result<Vec<T::T>, AnyError> {
         let values: Option<Vec<T::T>> = self.values::<T>(place)?.into_iter().collect();
-        values.ok_or_else(|| "a row has no value where each must have one".into())
+        values.ok_or_else(|| "a row has no value in a required column".into())
     }
 
     pub(crate) fn texts(&self, place: usize) -> Result<Vec<String>, AnyError> {

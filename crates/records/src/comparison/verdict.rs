@@ -57,12 +57,12 @@ pub(super) fn of_all(all: &[ConditionDifference], score: ComparedScore, compared
             format!("None of {} comparisons is decided; the largest difference is {}", all.len(), largest.verdict)
         }
         (some, _) => {
-            let told = |it: &&ConditionDifference| {
+            let describe = |it: &&ConditionDifference| {
                 format!("{} − {} on {} is {}", it.x, it.y, it.tested_on, points(it.difference, score))
             };
             let verb = if some.len() == 1 { "is" } else { "are" };
-            let told = some.iter().map(told).collect::<Vec<_>>().join(", ");
-            format!("{} of {} comparisons {verb} decided after Holm's correction: {told}", some.len(), all.len())
+            let listed = some.iter().map(describe).collect::<Vec<_>>().join(", ");
+            format!("{} of {} comparisons {verb} decided after Holm's correction: {listed}", some.len(), all.len())
         }
     }
 }
@@ -75,9 +75,9 @@ fn few_seeds_numbers(it: &ConditionDifference, score: ComparedScore) -> String {
     match &it.by_seed[..] {
         [] | [_] => format!("{head}{}", over_episodes.unwrap_or_default()),
         several => {
-            let told: Vec<String> = several.iter().map(|difference| signed(*difference)).collect();
+            let by_seed: Vec<String> = several.iter().map(|difference| signed(*difference)).collect();
             let apart = several.iter().any(|one| (one - it.difference).abs() > it.difference.abs() / 2.0);
-            format!("{head}, {}{} by seed", if apart { "but " } else { "" }, told.join(" and "))
+            format!("{head}, {}{} by seed", if apart { "but " } else { "" }, by_seed.join(" and "))
         }
     }
 }
