@@ -565,9 +565,9 @@ impl Config {
         let lacks = match (self.tls_cert.is_some(), authenticates) {
             _ if self.insecure => None,
             (true, true) => None,
-            (true, false) => Some("this server would not ask who they are"),
-            (false, true) => Some("tokens would go there unencrypted"),
-            (false, false) => Some("this server would neither encrypt nor ask who they are"),
+            (true, false) => Some("this server would not authenticate them"),
+            (false, true) => Some("tokens would be sent unencrypted"),
+            (false, false) => Some("this server would neither encrypt connections nor authenticate them"),
         };
         let others = |address: &&ListenAddress| match address {
             ListenAddress::Tcp(tcp) => !tcp.ip().to_canonical().is_loopback(),

@@ -217,7 +217,7 @@ impl LedgerWriter {
                 tracing::error!(
                     lines,
                     head,
-                    "the ledger {}: {reason}; nothing new is drawn before that",
+                    "the ledger {}: {reason}; until then requests that draw parameters are refused",
                     self.path.display()
                 );
             }

@@ -59,24 +59,24 @@ impl MetricsCollector {
     fn capacity(&self, page: &mut Page<'_>) -> EncodeResult {
         let MetricsSources { pool, sessions, leases, connections, budget, ledger, .. } = &*self.0;
         if let Some(status) = ledger.as_ref().map(Ledger::status) {
-            let help = "1 while the ledger's file is what this server wrote, else 0; then nothing is drawn";
+            let help = "1 if the ledger's file is intact; if 0, requests that draw parameters are refused";
             page.gauges("perturb_ledger_intact", help, [(NO_LABELS, f64::from(status.is_intact()))])?;
             page.gauges("perturb_ledger_bytes", "Length of the ledger", [(NO_LABELS, status.bytes() as f64)])?;
         }
         for (name, help, value) in [
             ("perturb_sessions", "Sessions now", sessions.in_use()),
-            ("perturb_sessions_limit", "The most sessions at a time", sessions.limit()),
+            ("perturb_sessions_limit", "Maximum number of sessions", sessions.limit()),
             ("perturb_sessions_detached", "Sessions now that have a lease and no stream", leases.detached()),
             ("perturb_connections", "Connections now", connections.in_use()),
             ("perturb_environments", "Environments now", pool.environments()),
-            ("perturb_environments_limit", "The most environments", pool.limit()),
+            ("perturb_environments_limit", "Maximum number of environments", pool.limit()),
             ("perturb_in_flight_bytes", "Bytes in flight now", budget.used()),
-            ("perturb_in_flight_bytes_limit", "The most bytes in flight", budget.limit()),
+            ("perturb_in_flight_bytes_limit", "Maximum number of bytes in flight", budget.limit()),
         ] {
             page.gauges(name, help, [(NO_LABELS, value as f64)])?;
         }
         let resumed = [(NO_LABELS, leases.resumed() as f64)];
-        page.counters("perturb_sessions_resumed", "How often a session was taken up by another stream", resumed)
+        page.counters("perturb_sessions_resumed", "Times that another stream resumed a session", resumed)
     }
 
     fn requests(&self, page: &mut Page<'_>) -> EncodeResult {
@@ -109,20 +109,20 @@ impl MetricsCollector {
             let used = meter.classes().filter(|(_, times)| times.counts().iter().any(|(_, count)| *count > 0));
             used.map(move |(class, times)| ([("environment", *name), ("batch", class)], times))
         });
-        let help = "How long a step request takes from its check to its reply, by the size of the batch";
+        let help = "Time of a step request from its validation to its reply, by batch size";
         page.histograms("perturb_step_seconds", help, each)?;
         let MetricsSources { pool, pictures, .. } = &*self.0;
-        let help = "How long a batch waits until a worker takes a part of it, each time";
+        let help = "Time that a batch waits in the queue until a worker takes a part of it";
         page.histograms("perturb_queue_wait_seconds", help, [(NO_LABELS, pool.waits())])?;
-        page.histograms("perturb_picture_seconds", "How long a picture is drawn", [(NO_LABELS, &**pictures)])
+        page.histograms("perturb_picture_seconds", "Time to draw a picture", [(NO_LABELS, &**pictures)])
     }
 
     fn transport(&self, page: &mut Page<'_>) -> EncodeResult {
         let names: Vec<String> = (0..self.0.threads.len()).map(|place| place.to_string()).collect();
         let threads = || names.iter().zip(&self.0.threads).map(|(name, thread)| ([("thread", name.as_str())], thread));
         let each = threads().map(|(name, thread)| (name, thread.load.connections() as f64));
-        page.gauges("perturb_transport_connections", "Connections now of a thread that talks to clients", each)?;
-        let help = "How late a thread wakes that talks to clients; 1 ms or 2 are the timer's own";
+        page.gauges("perturb_transport_connections", "Connections of a transport thread now", each)?;
+        let help = "Delay with which a transport thread wakes up; 1 to 2 ms are caused by the timer";
         page.histograms("perturb_transport_lag_seconds", help, threads().map(|(name, thread)| (name, &thread.lag)))
     }
 
@@ -134,10 +134,14 @@ impl MetricsCollector {
         page.gauges("perturb_token_sessions", "Sessions of a token now", each(|used| used.sessions as f64))?;
         page.gauges("perturb_token_environments", "Environments of a token now", each(|used| used.envs as f64))?;
         page.gauges("perturb_token_in_flight_bytes", "Bytes of a token in flight now", each(|used| used.bytes as f64))?;
-        let help = "How long requests of a token waited for its rate";
+        let help = "Time that requests of a token waited for its rate limit";
         page.counters("perturb_token_wait_seconds", help, each(|used| used.waited.as_secs_f64()))?;
         page.counters("perturb_token_steps", "Steps of a token's environments", each(|used| used.steps as f64))?;
-        page.counters("perturb_token_refusals", "What was refused to a token", each(|used| used.refusals as f64))
+        page.counters(
+            "perturb_token_refusals",
+            "Refused requests and sessions of a token",
+            each(|used| used.refusals as f64),
+        )
     }
 }
 
@@ -147,7 +151,7 @@ fn resources(page: &mut Page<'_>) -> EncodeResult {
     page.counters("process_cpu_seconds", "Processor time", [(NO_LABELS, resources.cpu_seconds)])?;
     for (name, help, value) in [
         ("process_resident_memory_bytes", "Memory in use", resources.resident_bytes as f64),
-        ("process_start_time_seconds", "When the process started, since 1970", resources.start_seconds),
+        ("process_start_time_seconds", "Start time of the process, since 1970", resources.start_seconds),
         ("process_threads", "Threads", resources.threads as f64),
         ("process_open_fds", "File descriptors in use", resources.descriptors as f64),
         (

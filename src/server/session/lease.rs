@@ -33,15 +33,13 @@ pub const MAX_STORED_REPLIES: u32 = 64;
 #[non_exhaustive]
 pub enum Error {
     /// No session has this lease.
-    #[error("no session here has the lease that came: it is over, or its session has ended; open another session")]
+    #[error("no session of this server has this lease: it has expired, or the session has ended; open another session")]
     Unknown,
     /// The session belongs to another token.
-    #[error("the session was opened with another token; show the one that it was opened with, or open another session")]
+    #[error("the session was opened with another token; use that token, or open another session")]
     OtherToken,
     /// The client claims to have received a reply that was never sent.
-    #[error(
-        "last_reply is {got}, but {last} is the last reply so far; opened is 0, and each response after it one more"
-    )]
+    #[error("last_reply is {got}, but the session's last reply so far is {last}; the reply to open is number 0")]
     NoReply {
         /// The `last_reply` of the client.
         got: u64,
@@ -50,8 +48,8 @@ pub enum Error {
     },
     /// Some replies after number `got`, which the client needs, are no longer stored.
     #[error(
-        "last_reply is {got}, but replies up to {first} are kept no more: open.lease said that so many requests would not \
-         wait, or there was no memory for them; open another session"
+        "last_reply is {got}, but replies up to {first} are no longer stored, because more requests were unanswered than \
+         open.lease allows, or there was no memory; open another session"
     )]
     Forgotten {
         /// The `last_reply` of the client.

@@ -126,7 +126,7 @@ async fn new_certificates_are_loaded_and_broken_ones_are_not() {
     let connection = connect(encrypted.address(), &[(CA, &encrypted.ca)]).await.unwrap();
     let mut session = begin(&connection, 1).await.unwrap();
     std::fs::write(encrypted.directory.path().join("server.pem"), "nothing").unwrap();
-    logged(&encrypted.server, "those of before stay in force").await;
+    logged(&encrypted.server, "the previous contents stay in force").await;
     connect(encrypted.address(), &[(CA, &encrypted.ca)]).await.unwrap();
 
     let other = Authority::new("another authority");

@@ -91,7 +91,7 @@ async fn a_token_that_is_taken_out_of_the_file_is_good_no_more() {
     let ann = guarded.connect(ANN).await;
     let mut session = begin(&ann, 1).await.unwrap();
     std::fs::write(&guarded.file, "[[token]]\nname = \"bob\"").unwrap();
-    logged(&guarded.server, "those of before stay in force").await;
+    logged(&guarded.server, "the previous contents stay in force").await;
     steps(&mut session, 1).await.expect("a broken file changes nothing");
     begin(&ann, 1).await.unwrap();
 

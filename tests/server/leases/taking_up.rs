@@ -61,9 +61,15 @@ async fn replies_are_stored_for_all_unanswered_requests() {
     let again = replies(&mut session, 1).await.remove(0).response.unwrap();
     assert!(format!("{again:?}").contains(&format!("{:?}", refusal.1)), "{again:?}");
     let (code, words) = not_resumed(server.tcp(), &opened.lease, 5).await;
-    assert!(code == Code::FailedPrecondition && words.contains("replies up to 6 are kept no more"), "{code} {words}");
+    assert!(
+        code == Code::FailedPrecondition && words.contains("replies up to 6 are no longer stored"),
+        "{code} {words}"
+    );
     let (code, words) = not_resumed(server.tcp(), &opened.lease, 11).await;
-    assert!(code == Code::OutOfRange && words.contains("last_reply is 11, but 10 is the last"), "{code} {words}");
+    assert!(
+        code == Code::OutOfRange && words.contains("last_reply is 11, but the session's last reply so far is 10"),
+        "{code} {words}"
+    );
     // Neither attempt affected the session, which continues on its stream.
     assert!(session.play(actor, 9, 12).await == expected[9..]);
 }
@@ -123,7 +129,7 @@ async fn refused_resume_leaves_the_stream_usable() {
     wrong[15] ^= 1;
     for lease in [wrong.into(), opened.lease.slice(..15), Bytes::new()] {
         let (code, words) = not_resumed(server.tcp(), &lease, 0).await;
-        assert!(code == Code::NotFound && words.contains("no session here has the lease"), "{code} {words}");
+        assert!(code == Code::NotFound && words.contains("no session of this server has this lease"), "{code} {words}");
     }
     let mut stream = Session::connect(server.tcp()).await;
     assert_eq!(stream.refused(perturb::proto::Resume::default()).await.0, Code::NotFound);
