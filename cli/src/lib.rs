@@ -1,4 +1,4 @@
-//! The program `perturb`: its commands, and the videos that it makes. What they do is in the packages below.
+//! The library of the program `perturb`: its command line, and its videos of policies. Other packages do the work.
 #![forbid(unsafe_code)]
 
 pub mod commands;

@@ -3,10 +3,12 @@
 #
 #     cli/tests/all_pairs.sh [EPISODES [DIRECTORY [JOBS]]]
 #
-# EPISODES to train each for (300), DIRECTORY for the runs, which replaces those of an earlier call (target/all-pairs), and
-# JOBS side by side (2: a learner keeps one core busy). Prints a line for each run. Exit status 1 if one failed or a figure
-# is not a finite number; what it said is in DIRECTORY/<pair and environment>/log. PROGRAMS says where `perturb` and
-# `perturb-server` are (target/release), TEST_EPISODES how many each is tested for (100), PAIRS and ENVIRONMENTS which.
+# EPISODES is the number of episodes of each training (default 300). DIRECTORY is the folder of the runs; a run replaces
+# that of an earlier call (default target/all-pairs). JOBS is the number of simultaneous runs (default 2; a learner
+# keeps one core busy). The script prints a line for each run. The exit status is 1 if a run failed or a result is not a
+# finite number; the log of the run is in DIRECTORY/<pair and environment>/log. Variables: PROGRAMS is the folder of
+# `perturb` and `perturb-server` (default target/release), TEST_EPISODES is the number of test episodes (default 100),
+# and PAIRS and ENVIRONMENTS select what is trained.
 set -eu
 
 : "${PAIRS:=a2c:ff a2c:rc ppo:ff ppo:rc epopt-a2c:ff epopt-a2c:rc epopt-ppo:ff epopt-ppo:rc rl2-a2c:rc rl2-ppo:rc}"
@@ -16,17 +18,17 @@ FORMAT='%-12s %-10s %-4s %9s %12s %8s  %s\n'
 : "${PROGRAMS:=target/release}" "${TEST_EPISODES:=100}" "${OPENBLAS_NUM_THREADS:=1}"
 export PROGRAMS TEST_EPISODES OPENBLAS_NUM_THREADS
 
-# One number of a result.
+# Prints one number of a result.
 figure() {
     sed -n "s/^ *\"$1\": *\([^,]*\),*$/\1/p" "$2"
 }
 
-# Whether all lines of CSV files that should be numbers are; what is not measured is left empty.
+# Tests whether all values in CSV files are finite numbers or empty. Values that were not measured are empty.
 finite() {
     ! grep -qiE '(^|,)[-+]?(nan|inf)' "$@"
 }
 
-# Trains and tests one pair; prints its line.
+# Trains and tests one pair in one environment, and prints a line with the results.
 one() {
     algorithm=$1 architecture=$2 environment=$3 episodes=$4
     run=$5/$environment-$algorithm-$architecture
@@ -50,7 +52,7 @@ one() {
             success=$(printf %.1f "$success") mean_return=$(printf %.2f "$mean_return")
         fi
     fi
-    # shellcheck disable=SC2059 # the format is ours
+    # shellcheck disable=SC2059 # the format is a constant of this script
     printf "$FORMAT" "$environment" "$algorithm" "$architecture" "$success" "$mean_return" \
         $(($(date +%s) - begun)) "$verdict" | tee "$run/line"
 }

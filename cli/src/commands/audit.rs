@@ -1,4 +1,4 @@
-//! `perturb audit`: replays recorded episodes, or checks ledgers.
+//! `perturb audit`: replays recorded episodes, or checks ledgers (servers' logs of everything that sessions drew).
 
 mod ledgers;
 mod table;
@@ -26,10 +26,10 @@ use super::{plan_in, reconnecting_servers, with_tasks_of};
 /// Maximum number of printed differences of each policy.
 const MAX_SHOWN: usize = 3;
 
-/// Number of folders from that of a cell up to that of its experiment.
+/// Number of folders from a cell's folder up to its experiment's folder, both included.
 const MAX_DEPTH: usize = 3;
 
-/// Recorded episodes and their policy.
+/// A policy with the file of its recorded test episodes.
 #[derive(Clone)]
 struct RecordedPolicy {
     name: String,
@@ -37,7 +37,7 @@ struct RecordedPolicy {
     checkpoint: PathBuf,
 }
 
-/// A policy that is audited.
+/// A policy to audit.
 enum AuditedPolicy {
     /// A policy whose recorded episodes are replayed.
     Recorded(RecordedPolicy),
@@ -82,13 +82,14 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
             recorded.into_iter().map(AuditedPolicy::Recorded).collect::<Vec<_>>()
         }
     };
+    // Audit one policy after the other, and print the result of each.
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = reconnecting_servers(&server_args(args)?, args.wait, &stop)?;
     let max_episodes = if args.all { usize::MAX } else { args.episodes };
     let mut audits = Vec::new();
     for policy in &policies {
         match policy.audit(&servers, max_episodes, &stop) {
-            // The command fails if there is only one policy, or if it was stopped.
+            // The command itself fails if there is only one policy, or if a signal stopped it.
             Err(error) if policies.len() == 1 || stop.signal().is_some() => return Err(error),
             audit => audits.push((policy.name(), audit.map_err(|error| error.to_string()))),
         }
@@ -96,10 +97,11 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
             audits.last().map_or(Ok(()), |(name, audit)| print(name, audit))?;
         }
     }
+    // Print the totals.
     let finished = || audits.iter().filter_map(|(_, audit)| audit.as_ref().ok());
     let replayed: u64 = finished().map(|audit| audit.episodes).sum();
     let different: usize = finished().map(|audit| audit.different.len()).sum();
-    // A checksum is of a whole test, so the number of differing episodes is not known.
+    // Each checksum covers a whole test, so the number of differing episodes is not known.
     let same = if table.is_some() && different > 0 { None } else { Some(replayed - different as u64) };
     let documents: Vec<_> = audits.iter().map(|(name, audit)| document(name, audit)).collect();
     args.json.write(json!({ "episodes": replayed, "same": same, "policies": documents }))?;
@@ -113,7 +115,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     Ok(if different == 0 && finished().count() == policies.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Returns the servers' arguments. Records of an experiment or of its cells need the tasks of its plan.
+/// Returns the servers' arguments. If the records belong to an experiment, they include the task folders of its plan.
 fn server_args(args: &AuditArgs) -> Result<ServerArgs> {
     let path = std::path::absolute(&args.dir).map_err(system("find the absolute path of the records"))?;
     let mut folders = path.ancestors().take(MAX_DEPTH).map(|path| Folder::new(path).plan_path());
@@ -123,10 +125,10 @@ fn server_args(args: &AuditArgs) -> Result<ServerArgs> {
     }
 }
 
-/// Result of a policy, or the reason why its episodes could not be replayed.
+/// The result of auditing a policy, or the reason why its episodes could not be replayed.
 type AuditOutcome = Result<Audit, String>;
 
-/// Prints the differences from the records.
+/// Prints the first differences from the records, or the reason why the episodes could not be replayed.
 fn print(name: &str, audit: &AuditOutcome) -> std::io::Result<()> {
     let lines = match audit {
         Ok(audit) => &audit.different[..audit.different.len().min(MAX_SHOWN)],
@@ -152,7 +154,8 @@ impl RecordedPolicy {
     }
 }
 
-/// Finds the policies that `args` names.
+/// Finds the policies with recorded episodes that `args` names: those of an assessment, of a file of records, of a
+/// cell, or of all finished cells of an experiment.
 fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
     let path = &args.dir;
     let cell = |path: &Path| RecordedPolicy {
@@ -172,7 +175,7 @@ fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
         let name = path.display().to_string();
         return Ok(vec![RecordedPolicy { name, records: records_file(path), checkpoint: checkpoint.clone() }]);
     }
-    // The policy of the cell in `path`, after those of its intermediate evaluations.
+    // Returns the policies of a cell's intermediate evaluations, and then its final policy.
     let policies_of_cell = |path: &Path| -> Result<Vec<RecordedPolicy>> {
         let intermediate = |records: PathBuf| {
             let mark = records.file_name().unwrap_or_default().to_string_lossy().into_owned();
@@ -206,7 +209,8 @@ fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
     Ok(policies)
 }
 
-/// Returns the policies of an assessment whose checkpoints are in `checkpoints`. Prints the names of the others.
+/// Returns the policies of an assessment that have a checkpoint in `checkpoints`. Prints a line about each other
+/// policy.
 fn policies_of_assessment(path: &Path, checkpoints: &[PathBuf]) -> Result<Vec<RecordedPolicy>> {
     let assessed = ExternalEvaluation::read(path)?;
     let id = |path: &PathBuf| -> Result<(PathBuf, String)> {

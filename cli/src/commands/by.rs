@@ -1,4 +1,4 @@
-//! Test results by context or by the value of a parameter, the worst first.
+//! Option --by: tables of test results by context or by the value of a parameter, the worst first.
 
 use perturb_learner::proto::Environment;
 use perturb_records::outcomes::{Outcomes, bins};
@@ -12,10 +12,10 @@ use perturb_text::Table;
 use super::error::{CommandError, Result};
 use super::sets::parameter;
 
-/// Value of --by that groups episodes by their context, i.e. by all of its parameters together.
+/// Value of --by that groups the episodes of a grid or a list by their contexts.
 const CONTEXT: &str = "context";
 
-/// The episodes of a test that have something in common.
+/// The episodes of a test in one context, or with one value or bin of a parameter.
 struct ValueGroup<'a> {
     set: &'a str,
     label: String,
@@ -23,7 +23,7 @@ struct ValueGroup<'a> {
     successes: u64,
 }
 
-/// Returns `by` as `environment` spells it.
+/// Returns the value of --by with the parameter's name as `environment` spells it.
 ///
 /// # Errors
 /// [`ValueError`] if it is neither a parameter nor `context`.
@@ -31,11 +31,13 @@ pub(super) fn checked_by(by: &str, environment: &Environment) -> Result<String, 
     if by == CONTEXT { Ok(by.to_owned()) } else { Ok(parameter("--by", by, environment)?.to_owned()) }
 }
 
-/// Returns the success of each test by `by`, a parameter or `context`: of a grid or a list for each of its values, of drawn
-/// parameters in tenths of the range. Within a test the lowest success rate comes first, of equal ones the lowest return.
+/// Returns a table of the success in each test, grouped by `by`: a parameter's name, or `context`.
+///
+/// A grid or a list has a row for each value of the parameter. If the parameter is drawn, each tenth of its range has a
+/// row. The rows of a test are ordered by success rate and then by mean return, lowest first.
 ///
 /// # Errors
-/// [`CommandError::Usage`] for an unknown parameter, and if nothing can be told apart by it.
+/// [`CommandError::Usage`] if there is no such parameter, or if it has a single value in every test.
 pub(super) fn table_by(records: &Records, criterion: Option<&Criterion>, by: &str) -> Result<Table> {
     let mut rows = Vec::new();
     for test in &records.about.tests {
@@ -82,7 +84,8 @@ impl ValueGroup<'_> {
     }
 }
 
-/// Returns the places of the episodes of a test by label, in the order of the values; none if they do not vary.
+/// Groups the episodes of a test by `by`. Returns the label of each group with the positions of its episodes in the
+/// test, in the order of the values. The result is empty if all episodes have the same value.
 fn labels(records: &Records, set: &str, by: &str, contexts: &Contexts) -> Result<Vec<(String, Vec<usize>)>> {
     let outcomes = Outcomes::new(records, set);
     if by == CONTEXT {
@@ -114,7 +117,7 @@ fn labels(records: &Records, set: &str, by: &str, contexts: &Contexts) -> Result
     let mut told = vec![false; values.len()];
     let mut found = Vec::new();
     for bin in bins(std::iter::once(&outcomes), parameter) {
-        // An end that two parts share belongs to the lower one here, so that each episode counts once.
+        // A value on the edge between two bins belongs to the lower bin, so that each episode counts once.
         let mut places = within(bin.low, bin.high);
         places.retain(|&place| !told[place]);
         places.iter().for_each(|&place| told[place] = true);

@@ -1,4 +1,4 @@
-//! Runs the cells of a plan with any backend.
+//! Runs the cells of a plan in rounds, with a backend for local processes or Slurm.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -20,27 +20,27 @@ use super::{json, report};
 /// Maximum number of success rates that are printed at the end.
 const MAX_RATES: usize = 24;
 
-/// Runs a plan's cells, and afterwards the cells that its tuning selects.
+/// Runs a plan's cells in a first round, and the cells that its tuning selects in a second round.
 pub(super) struct PlanRunner<'a> {
     args: &'a RunArgs,
     folder: &'a Folder,
-    /// Cells that --done has.
+    /// Finished cells in the table of --done.
     done: Option<&'a DoneCells<'a>>,
     stop: &'a StopFlag,
     /// The plan with all cells that are known so far.
     plan: Plan,
-    /// Failures that existed when the run began, and that --retry-failed runs again.
+    /// Failed cells of an earlier run, by id. --retry-failed runs them again.
     retryable: HashMap<String, FailureId>,
     /// End of the last round; `None` before the first round.
     end: Option<RunEnd>,
-    /// Success of the finished cells.
+    /// Success rates of the finished cells, by kind of cell (environment, method and training set).
     rates: Vec<Rate>,
-    /// Output of the events as JSON lines.
+    /// Output for the cells' events as JSON lines.
     events: Option<Box<dyn Write>>,
 }
 
 impl<'a> PlanRunner<'a> {
-    /// Writes the plan to its folder.
+    /// Makes the runner, and copies the plan into the folder.
     pub(super) fn begin(
         args: &'a RunArgs,
         plan: Plan,
@@ -54,8 +54,8 @@ impl<'a> PlanRunner<'a> {
         Ok(Self { args, folder, done, stop, plan, retryable, end: None, rates: Vec::new(), events })
     }
 
-    /// Returns the next plan to run: the given one, then the one with the selected cells. Returns `None` at the end.
-    /// Cells that --done has are left out.
+    /// Returns the plan of the next round: the given plan, and then the same plan with the selected cells. It does not
+    /// have the finished cells of --done. Returns `None` when no round is left.
     pub(super) fn next_round(&mut self) -> Result<Option<Plan>> {
         match self.end {
             None => {}
@@ -107,6 +107,7 @@ impl<'a> PlanRunner<'a> {
         if rates.len() > MAX_RATES {
             note(format_args!("and {} more: perturb report {}", rates.len() - MAX_RATES, quoted(folder.path())));
         }
+        // After a signal, print how to resume. Otherwise find the failed cells.
         let failed = match end {
             Some(RunEnd::Stopped { signal, left }) => {
                 let jobs = left.join(" ");
@@ -144,12 +145,12 @@ impl<'a> PlanRunner<'a> {
     }
 }
 
-/// Returns the states in `folder`, and those of `done` for cells that are missing there.
+/// Returns the states of cells in `folder`. Cells that are missing there have their states in `done`.
 pub(super) fn layered<'a>(folder: &'a Folder, done: Option<&'a DoneCells<'a>>) -> LayeredStates<'a> {
     LayeredStates { first: folder, then: done.map(|done| done as &dyn CellStates) }
 }
 
-/// Returns `plan` without the cells that are in `done`.
+/// Returns `plan` without the cells that are finished in `done`.
 pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Result<Plan> {
     let Some(done) = done else { return Ok(plan) };
     let mut left = Vec::new();
@@ -162,8 +163,8 @@ pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Resu
     Ok(plan)
 }
 
-/// Copies the plan into its folder, and prints a note if it replaces another one. With --cell an existing plan is kept,
-/// because a job that had to wait may have an older plan.
+/// Copies the plan into its folder, and prints a note if it replaces another plan. With --cell an existing plan is not
+/// replaced, because a job that waited in a queue may have an older plan.
 fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
     let path = folder.plan_path();
     if !args.cell.is_empty() && path.exists() {

@@ -1,4 +1,4 @@
-//! `perturb compare`.
+//! `perturb compare`: compares conditions over their seeds.
 
 mod table;
 
@@ -23,21 +23,22 @@ use super::display::{Display, note, output};
 use super::error::{CommandError, Result, system};
 use super::{playing_servers, sets};
 
-/// The extension of a policy in a single file.
+/// The file name extension of a policy that is stored in a single file.
 const POLICY_EXTENSION: &str = "safetensors";
 
 /// A policy of a condition.
 enum ComparedPolicy {
     /// A policy whose tests were recorded.
     Recorded(Box<Records>),
-    /// A policy that this command tests.
+    /// A policy that this command tests itself.
     Trained(Box<Checkpoint>),
 }
 
-/// A condition's name, and the tests of its policies by the key that pairs them.
+/// A condition's name, and the recorded tests of its policies. Each policy has a key, and policies of two conditions
+/// are paired by equal keys.
 type TestedPolicies = (String, Vec<(String, Records)>);
 
-/// A condition's name, and its policies by the key that pairs them.
+/// A condition: its name, and its policies with their keys.
 struct NamedPolicies {
     name: String,
     policies: Vec<(String, ComparedPolicy)>,
@@ -127,7 +128,7 @@ fn condition(text: &str) -> Result<NamedPolicies> {
     Ok(NamedPolicies { policies: policies.collect(), name })
 }
 
-/// Returns the seed of a policy's training, if it is known.
+/// Returns the seed of a policy's training. Returns `None` for recorded tests, which do not have it.
 fn seed(policy: &ComparedPolicy) -> Option<String> {
     match policy {
         ComparedPolicy::Trained(checkpoint) => Some(checkpoint.state.config.common.seed.to_string()),
@@ -135,7 +136,7 @@ fn seed(policy: &ComparedPolicy) -> Option<String> {
     }
 }
 
-/// Returns the policy at `path`, or if there is none those in its folders, by name.
+/// Loads the policy at `path`. If there is none, loads the policies in the folder `path`, in the order of their names.
 fn policies_at(path: &Path) -> Result<Vec<ComparedPolicy>> {
     let error = match policy_at(path) {
         Ok(policy) => return Ok(vec![policy]),
@@ -167,7 +168,7 @@ fn policy_at(path: &Path) -> Result<ComparedPolicy> {
     Ok(ComparedPolicy::Trained(Box::new(Checkpoint::load(path)?)))
 }
 
-/// Returns the sets that are compared: those of the arguments, or the recorded ones that all recorded policies have.
+/// Returns the sets to compare on: those of the arguments, or else the sets that all recorded tests have in common.
 fn tested_sets(args: &CompareArgs, conditions: &[NamedPolicies]) -> Result<Vec<TestSet>> {
     let is_given = !args.versions.is_empty() || !args.set.parameters.is_empty() || args.set.contexts.is_some();
     let policies = conditions.iter().flat_map(|condition| &condition.policies);
@@ -196,7 +197,7 @@ fn tested_sets(args: &CompareArgs, conditions: &[NamedPolicies]) -> Result<Vec<T
     Ok(common)
 }
 
-/// Tests the policies that were not tested, and judges all by the rule of success.
+/// Tests the policies without recorded tests, and judges all episodes by the success rule of --success.
 fn test(args: &CompareArgs, conditions: Vec<NamedPolicies>, sets: &[TestSet]) -> Result<Vec<TestedPolicies>> {
     let policies = || conditions.iter().flat_map(|condition| &condition.policies);
     let plays = policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Trained(_)));

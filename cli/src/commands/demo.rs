@@ -1,6 +1,7 @@
 //! `perturb demo`: a small version of the paper's experiment.
 //!
-//! Does a policy still work where it was not trained, and does training on random physics help?
+//! It trains one policy on default physics and one on random physics, and tests both on physics that they were not
+//! trained on.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -28,11 +29,11 @@ use super::error::{CommandError, Result, system};
 use super::{reconnecting_servers, refuse_file, require_default_out, signal_code, threads};
 use crate::video::{VideoError, VideoFile, VideoOptions, film};
 
-/// Training episodes of the paper's results.
+/// Number of episodes of each training in the paper.
 const PAPER_EPISODES: u64 = 15_000;
-/// Test episodes of the paper's results.
+/// Number of episodes of each test in the paper.
 const PAPER_TEST_EPISODES: u64 = 1000;
-/// Runs of the paper's results.
+/// Number of runs in the paper, over which it gives means.
 const PAPER_RUNS: u64 = 5;
 /// Versions on which policies are trained.
 const TRAINED_ON: [Version; 2] = [Version::D, Version::R];
@@ -40,11 +41,11 @@ const TRAINED_ON: [Version; 2] = [Version::D, Version::R];
 const GRID: usize = 12;
 /// Number of test episodes at each point of the heatmap.
 const POINT_EPISODES: u64 = 5;
-/// Maximum number of test episodes that are searched for one to film.
+/// Maximum number of seeds that are tried to find an episode to film.
 const MAX_TRIES: u64 = 20;
 /// Width and height of the films.
 const PIXELS: (u32, u32) = (240, 240);
-/// Steps between two frames of the films. Drawing a robot takes some 60 ms.
+/// Number of steps between two frames of the films. It limits the time of drawing, about 60 ms for a robot.
 const FRAME_STEPS: u32 = 8;
 
 /// A trained policy with its success rate on each version, in percent.
@@ -156,7 +157,7 @@ impl Demo<'_> {
         Ok(DemoPolicy { version, checkpoint: outcome.checkpoint, rates })
     }
 
-    /// Compares the results with the paper's, each with its number of runs and episodes.
+    /// Returns a table of these results beside the paper's, with the numbers of runs and episodes of both.
     fn comparison_table(&self, environment: &str, trained: &[DemoPolicy]) -> Table {
         let rates: BTreeMap<Scenario, f64> = trained
             .iter()
@@ -238,7 +239,7 @@ impl Demo<'_> {
         Ok(films)
     }
 
-    /// Searches for the seed of an episode with this outcome.
+    /// Returns the first seed whose test episode has this outcome, or `None` after [`MAX_TRIES`] seeds.
     fn find_episode(&self, checkpoint: &Checkpoint, version: Version, success: bool) -> Result<Option<u64>> {
         for seed in self.args.seed..self.args.seed + MAX_TRIES {
             let result = test(&self.servers, checkpoint, version, 1, seed, &self.stop, |_| {})?;
@@ -258,11 +259,11 @@ impl Demo<'_> {
     }
 }
 
-/// Returns the number of training episodes if `--episodes` is not given, and the settings that are not the defaults.
+/// Returns the default number of training episodes in an environment, and the settings that differ from the defaults.
 ///
-/// Policies for CartPole are trained for long at a high learning rate, as in experiments/quick.toml. With the defaults
-/// they would succeed everywhere, and there would be nothing to repair. Minibatches halve the number of episodes that
-/// Hopper needs, and a falling learning rate keeps its last policies from getting worse.
+/// CartPole has a high learning rate, as in experiments/quick.toml. With default settings a policy that was trained on
+/// D succeeds on all versions, so training on R would show no improvement. Hopper needs half as many episodes with more
+/// minibatches, and a falling learning rate prevents its policy from getting worse at the end.
 fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     match environment {
         "CartPole" => (1500, &["learning_rate=3e-3"]),
@@ -271,7 +272,7 @@ fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     }
 }
 
-/// Calls two functions at the same time. One alone leaves a core idle, because server and learner work by turns.
+/// Calls two functions in parallel. A single training leaves a core idle, because server and learner work alternately.
 fn side_by_side<A: Send, B: Send>(first: impl FnOnce() -> A + Send, second: impl FnOnce() -> B) -> (A, B) {
     std::thread::scope(|scope| {
         let first = scope.spawn(first);
@@ -280,7 +281,7 @@ fn side_by_side<A: Send, B: Send>(first: impl FnOnce() -> A + Send, second: impl
     })
 }
 
-/// Returns a sentence about one policy.
+/// Returns a sentence with a policy's success rates.
 fn first_result(policy: &DemoPolicy) -> String {
     let rates: Vec<_> = policy.rates.iter().map(|(test, rate)| format!("{rate:.1} % on {test}")).collect();
     format!("Trained on {}, the policy succeeds in {}.", policy.version, rates.join(", "))
@@ -295,7 +296,7 @@ fn rates_table(trained: &[DemoPolicy]) -> Table {
     table.build()
 }
 
-/// Returns the tables' content in a sentence.
+/// Returns a summary of the tables in two sentences.
 fn conclusion(trained: &[DemoPolicy]) -> String {
     let rate = |policy: usize, test| trained[policy].rates.get(&test).copied().unwrap_or_default();
     let [dd, dr, de] = Version::ALL.map(|test| rate(0, test));

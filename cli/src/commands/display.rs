@@ -1,4 +1,4 @@
-//! Progress on standard error: a bar on a terminal, which fits its width, and plain lines elsewhere.
+//! Progress on standard error. A terminal shows a bar that fits its width; other outputs get plain lines.
 
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -14,16 +14,17 @@ use perturb_protocol::escape_lines;
 use perturb_settings::TrainConfig;
 use perturb_text::{duration, grouped};
 
-/// Time between two plain lines.
+/// Minimum time between two plain lines.
 const LINE_INTERVAL: Duration = Duration::from_secs(5);
-/// Maximum number of groups of cells in work that a terminal shows, and of kinds of finished cells.
+/// Maximum number of lines with running groups of cells, and maximum number of lines with success rates of finished
+/// cells.
 const MAX_SHOWN: usize = 8;
-/// Time before the first estimate of the remaining time; earlier ones would be guesses.
+/// Time before the first estimate of the remaining time. Earlier estimates would be unreliable.
 const MIN_ELAPSED: Duration = Duration::from_secs(1);
 
-/// Whether only warnings and errors are printed.
+/// Whether --quiet is given, so that only warnings and errors are printed.
 static QUIET: AtomicBool = AtomicBool::new(false);
-/// The bars on the terminal, and their number, if there are any.
+/// The progress bars on the terminal and their number; `None` without a bar.
 static CURRENT_BARS: Mutex<Option<(MultiProgress, usize)>> = Mutex::new(None);
 
 /// Suppresses [`note`] and progress from now on.
@@ -42,18 +43,19 @@ pub(super) fn note(sentence: impl std::fmt::Display) {
     }
 }
 
-/// Prints a line on standard error, also with --quiet. Ignores errors, since a closed standard error is no reason to
-/// stop. Texts of servers and names of files in it do not drive the terminal.
+/// Prints a line on standard error, also with --quiet. Escapes control characters, because the line may contain texts
+/// of servers and names of files. Ignores errors, so that a closed standard error does not end the command.
 pub(super) fn say(line: impl std::fmt::Display) {
     let _ = writeln!(AboveBar, "{}", escape_lines(&line.to_string()));
 }
 
-/// Returns standard output for text. Texts of servers and names of files in it do not drive the terminal.
+/// Returns a writer to standard output that escapes control characters, because the text may contain texts of servers
+/// and names of files.
 pub(super) fn output() -> TextOutput {
     TextOutput(std::io::stdout())
 }
 
-/// Standard output, which escapes what a terminal would obey.
+/// A writer to standard output that escapes control characters.
 pub(super) struct TextOutput(std::io::Stdout);
 
 impl Write for TextOutput {
@@ -62,7 +64,7 @@ impl Write for TextOutput {
         Ok(bytes.len())
     }
 
-    /// Writes the whole text at once, because a piece may end within a character.
+    /// Writes the whole text at once, because a part of the text may end in the middle of a UTF-8 character.
     fn write_fmt(&mut self, words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
         self.write_all(words.to_string().as_bytes())
     }
@@ -72,7 +74,7 @@ impl Write for TextOutput {
     }
 }
 
-/// Writes to standard error, above the bar on the terminal.
+/// A writer to standard error that prints its lines above the progress bar.
 pub(super) struct AboveBar;
 
 impl Write for AboveBar {
@@ -89,7 +91,7 @@ impl Write for AboveBar {
         }
     }
 
-    /// Writes the whole text at once, because each piece would become a line.
+    /// Writes the whole text at once, because each write becomes a separate line above the bar.
     fn write_fmt(&mut self, words: std::fmt::Arguments<'_>) -> std::io::Result<()> {
         self.write_all(words.to_string().as_bytes())
     }
@@ -103,24 +105,25 @@ fn current_bars() -> MutexGuard<'static, Option<(MultiProgress, usize)>> {
     CURRENT_BARS.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Returns the width of the terminal on standard output, in columns; `None` if it is no terminal.
+/// Returns the width of the terminal on standard output, in columns. Returns `None` if standard output is not a
+/// terminal.
 pub(super) fn terminal_width() -> Option<usize> {
     std::io::stdout().is_terminal().then(|| usize::from(console::Term::stdout().size().1))
 }
 
-/// The progress of a training or a test in episodes, or of a run in cells.
+/// A display of the progress of a training or a test in episodes, or of an experiment in cells.
 pub(super) struct Display {
     bar: Option<Bar>,
     what: String,
     unit: &'static str,
     total: u64,
-    /// For a training: its speed, and the number of episodes that it generates.
+    /// For a training: its progress, and the total number of episodes that it will generate.
     pace: Option<(TrainingProgress, f64)>,
     start: Instant,
     last_line: Option<Instant>,
 }
 
-/// A bar with lines below it, which are cut at the terminal's width.
+/// A progress bar with lines of text below it. Lines are cut at the terminal's width.
 struct Bar {
     all: MultiProgress,
     bar: ProgressBar,
@@ -128,7 +131,7 @@ struct Bar {
 }
 
 impl Display {
-    /// Makes the display of a training that begins after this number of episodes and steps.
+    /// Makes the display of a training that has already finished this number of episodes and steps.
     pub(super) fn for_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
         let budget = config.common.episodes;
         let mut pace = TrainingProgress::default();
@@ -143,14 +146,14 @@ impl Display {
         Self::new(format!("{} ", what.into()), "episodes", total)
     }
 
-    /// Makes the display of a run with `total` cells.
+    /// Makes the display of an experiment with `total` cells.
     pub(super) fn for_cells(total: usize) -> Self {
         Self::new(String::new(), "cells", total as u64)
     }
 
     fn new(what: String, unit: &'static str, total: u64) -> Self {
         let bar = (std::io::stderr().is_terminal() && !is_quiet()).then(|| Bar::new(&what, total));
-        // Short tasks print no line.
+        // A task in episodes waits one interval before its first line, so a short task prints none.
         let last_line = (unit == "episodes").then(Instant::now);
         Self { bar, what, unit, total, pace: None, start: Instant::now(), last_line }
     }
@@ -178,8 +181,8 @@ impl Display {
         self.show(episodes, &Vec::from_iter(time), Vec::new);
     }
 
-    /// Shows the progress of a run. A terminal also shows the groups of cells in work, and the success of finished
-    /// cells.
+    /// Shows the progress of an experiment. A terminal also shows the running groups of cells, and the success rates of
+    /// finished cells.
     pub(super) fn cells(&mut self, status: &RunStatus) {
         let RunStatus { done, failed, running, doing, remaining, rates, .. } = status;
         let mut figures = vec![doing.clone()];
@@ -220,14 +223,15 @@ impl Display {
     }
 }
 
-/// Joins as many whole figures as fit into `width`, at least the first. A cut figure could be mistaken for another one.
+/// Joins the first `figures` that fit into `width` columns, at least one. Figures that do not fit are left out, because
+/// a number that is cut off could be misread.
 fn fitting(figures: &[String], width: usize) -> String {
     let fits = |n: &usize| console::measure_text_width(&figures[..*n].join(", ")) <= width;
     let n = (1..=figures.len()).rev().find(fits).unwrap_or(1);
     figures[..n].join(", ")
 }
 
-/// Keeps [`MAX_SHOWN`] lines and adds a line with the number of the others.
+/// Returns the first [`MAX_SHOWN`] lines. If there are more, adds a line with their number.
 fn first_lines(mut lines: Vec<String>) -> Vec<String> {
     let more = lines.len().saturating_sub(MAX_SHOWN);
     lines.truncate(MAX_SHOWN);
@@ -241,7 +245,8 @@ impl Bar {
         let (all, number) = bars.get_or_insert_with(|| (MultiProgress::new(), 0));
         *number += 1;
         let bar = ProgressBar::new(total).with_style(style("{prefix}{wide_bar} {percent:>3} %"));
-        // Setting the prefix later would draw the bar once more, and that copy would stay.
+        // The prefix is set before the bar is added. Setting it later would leave a second copy of the bar on the
+        // screen.
         let bar = all.add(bar.with_prefix(what.to_owned()));
         Self { all: all.clone(), bar, lines: Vec::new() }
     }
@@ -260,7 +265,7 @@ impl Bar {
     }
 }
 
-/// Returns the style of a template. All templates are in this file and valid.
+/// Returns the style of a template. All templates are in this file and are valid.
 fn style(template: &str) -> ProgressStyle {
     ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar())
 }

@@ -1,4 +1,4 @@
-//! `perturb envs`.
+//! `perturb envs`: lists the environments with their parameters.
 
 use std::io::Write;
 

@@ -23,10 +23,10 @@ use crate::video::VideoError;
 
 pub(super) type Result<T, E = CommandError> = std::result::Result<T, E>;
 
-/// A command has failed. The message includes the messages of its causes.
+/// The error of a failed command. Its message includes the messages of its causes.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum CommandError {
-    /// The command line is wrong.
+    /// An argument is wrong.
     #[error("{0}")]
     Usage(String),
     #[error("{0}")]
@@ -36,7 +36,7 @@ pub(super) enum CommandError {
     /// Standard output cannot be written.
     #[error("cannot write: {0}")]
     Output(#[from] std::io::Error),
-    /// A heatmap of an experiment has failed.
+    /// The test for a heatmap of an experiment has failed. `place` names the heatmap's policy.
     #[error("{place}: {source}")]
     Heatmaps { place: String, source: Box<CommandError> },
     #[error(transparent)]
@@ -108,7 +108,7 @@ impl CommandError {
         }
     }
 
-    /// Tells whether an argument or file is missing or wrong, so that nothing was begun.
+    /// Tells whether an argument or file is missing or wrong, so that the command did not begin.
     pub(super) fn is_usage(&self) -> bool {
         match self {
             Self::Usage(_)
@@ -145,7 +145,7 @@ impl CommandError {
         }
     }
 
-    /// Tells whether the reader of the output has gone, as in `perturb envs | head`.
+    /// Tells whether the reader of the output has ended, as in `perturb envs | head`.
     pub(super) fn is_closed_pipe(&self) -> bool {
         match self {
             Self::Output(error) | Self::File(FileError { source: error, .. }) => error.kind() == ErrorKind::BrokenPipe,
@@ -154,7 +154,8 @@ impl CommandError {
     }
 }
 
-/// Adds the searched folders to the error about a missing checkpoint. Asks about the single similar name.
+/// Returns the message of a checkpoint's error. Adds the searched folders if there is no checkpoint, and suggests a
+/// similar name if there is exactly one.
 fn with_searched_folders(error: &CheckpointError) -> String {
     match error {
         CheckpointError::Missing { .. } => {
@@ -167,7 +168,7 @@ fn with_searched_folders(error: &CheckpointError) -> String {
     }
 }
 
-/// Adds how a task of a folder is served to the error about an unknown environment.
+/// Returns the message of a client's error. Adds a hint about --task if the environment is unknown.
 fn with_task_hint(error: &ClientError) -> String {
     match error {
         ClientError::NoEnvironment(UnknownEnvironment::Name { .. }) => {
@@ -177,12 +178,12 @@ fn with_task_hint(error: &ClientError) -> String {
     }
 }
 
-/// Makes an error of an operating system call. `action` completes the sentence "cannot …".
+/// Makes the error of a failed system call. `action` completes the sentence "cannot …".
 pub(super) fn system(action: &'static str) -> impl FnOnce(std::io::Error) -> CommandError {
     move |source| CommandError::System { action, source }
 }
 
-/// Tells whether --server or the request to it was wrong from the beginning.
+/// Tells whether the error is due to a wrong argument, such as --server or an environment's name.
 fn is_wrong_server(error: &ClientError) -> bool {
     matches!(
         error,
@@ -199,7 +200,7 @@ fn is_wrong_server(error: &ClientError) -> bool {
     )
 }
 
-/// Tells whether the directory of a run was wrong.
+/// Tells whether the error is due to a wrong path of a run's directory.
 fn is_wrong_directory(error: &RunDirectoryError) -> bool {
     match error {
         RunDirectoryError::File(error) => is_wrong_file(error),
@@ -209,7 +210,7 @@ fn is_wrong_directory(error: &RunDirectoryError) -> bool {
     }
 }
 
-/// Tells whether the path of a file is wrong, rather than the disk full or broken.
+/// Tells whether the error is due to a wrong path of a file, as opposed to a full or broken disk.
 fn is_wrong_file(error: &FileError) -> bool {
     matches!(
         error.source.kind(),

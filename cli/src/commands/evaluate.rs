@@ -1,4 +1,4 @@
-//! `perturb evaluate`.
+//! `perturb evaluate`: tests a policy.
 
 use std::io::Write;
 
@@ -38,6 +38,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     let success =
         args.success.as_ref().map(|rule| sets::normalize_rule(rule, text.as_ref(), code.as_ref())).transpose()?;
     let by = args.by.as_deref().map(|by| checked_by(by, &environment)).transpose()?;
+    // Play the tests. Each set has its own progress display.
     let options = TestOptions { episodes: args.episodes, seed, selects: args.selection_episodes, success };
     let tester = Tester::new(&servers, &checkpoint, options)?;
     let mut display: Option<(String, Display)> = None;
@@ -55,6 +56,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     if let Some(path) = &args.records {
         records.write(path)?;
     }
+    // Print the results as JSON or as a table.
     let results: Vec<(String, TestResult)> =
         sets.iter().map(|set| (set.name.clone(), records.result(&set.name, None))).collect();
     args.json.write(document(state, seed, &results))?;
@@ -88,7 +90,7 @@ pub(super) fn run(args: &EvaluateArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the result as JSON: the policy and the figures of each set.
+/// Returns the result as JSON: the settings of the policy's training, and the statistics of each test.
 fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)]) -> Value {
     let results: Map<String, Value> = results.iter().map(|(set, result)| (set.clone(), json!(result))).collect();
     let TrainConfig { common, settings } = &state.config;

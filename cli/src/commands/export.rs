@@ -1,4 +1,4 @@
-//! `perturb export`: the results of experiments as rows of a table, and their policies beside it.
+//! `perturb export`: adds the results of experiments to a table, and stores their policies beside the table.
 
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -15,7 +15,7 @@ use super::display::{note, output};
 use super::error::{CommandError, Result, system};
 use super::plan_in;
 
-/// The folder of stored policies beside a table.
+/// The name of the folder with stored policies, which is beside a results table.
 pub(super) const POLICIES: &str = "policies";
 
 pub(super) fn run(args: &ExportArgs) -> Result<()> {
@@ -25,6 +25,7 @@ pub(super) fn run(args: &ExportArgs) -> Result<()> {
         require_writable(&args.into)?;
         ResultsTable::read_if_there(&args.into)?.unwrap_or_default()
     };
+    // The folder of each study, by the study's name.
     let mut folders: BTreeMap<String, &Path> = BTreeMap::new();
     for dir in &args.dirs {
         let study = study(args, dir)?;
@@ -60,7 +61,7 @@ fn count_studies(studies: usize) -> String {
     if studies == 1 { "1 study".into() } else { format!("{studies} studies") }
 }
 
-/// Returns the name of the study in `dir`: --study, or the folder's name.
+/// Returns the name of the study for the results in `dir`: --study, or the folder's name.
 fn study(args: &ExportArgs, dir: &Path) -> Result<String> {
     if let Some(study) = &args.study {
         return Ok(study.clone());
@@ -70,7 +71,7 @@ fn study(args: &ExportArgs, dir: &Path) -> Result<String> {
     name.ok_or_else(|| CommandError::Usage(format!("{} has no name: give --study", dir.display())))
 }
 
-/// Adds the cells in `dir`, and with --policies their policies and episodes.
+/// Adds the results of the cells in `dir` to the table. With --policies it also stores their policies and episodes.
 fn add(args: &ExportArgs, table: &mut ResultsTable, study: &str, dir: &Path) -> Result<MergeCounts> {
     let folder = Folder::new(dir);
     let plan = plan_in(&folder)?;

@@ -1,4 +1,4 @@
-//! `perturb heatmap`.
+//! `perturb heatmap`: draws the success of policies over two parameters.
 
 mod experiment;
 
@@ -60,6 +60,7 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
         None => CommandError::Usage(format!("{error}; give another path with --out")),
     })?;
     let mut out = output();
+    // Test each policy, or compute its heatmap from the recorded episodes of --records.
     let mut policies = Vec::new();
     for (index, checkpoint) in checkpoints.iter().enumerate() {
         let heatmap = if let Some(records) = recorded.get(index) {
@@ -91,7 +92,7 @@ fn draw_checkpoints(args: &HeatmapArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the environment of all policies. Refuses policies of several environments.
+/// Returns the environment that all policies were trained in. Refuses policies of different environments.
 fn one_environment(paths: &[PathBuf], checkpoints: &[Checkpoint]) -> Result<String> {
     let environment = |checkpoint: &Checkpoint| checkpoint.state.config.common.environment.clone();
     let named: Vec<(&Path, String)> =
@@ -109,7 +110,7 @@ fn one_environment(paths: &[PathBuf], checkpoints: &[Checkpoint]) -> Result<Stri
     }
 }
 
-/// Returns the parameters of --x and --y, or else the environment's own choice.
+/// Returns the parameters on the x and y axis: those of --x and --y, or else the environment's default axes.
 fn axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String; 2]> {
     if let (Some(x), Some(y)) = (&args.x, &args.y) {
         return Ok([axis(x, environment)?, axis(y, environment)?]);
@@ -120,7 +121,7 @@ fn axes(args: &HeatmapArgs, environment: &proto::Environment) -> Result<[String;
     })
 }
 
-/// Returns the name of an environment's parameter, which may be written in any case.
+/// Returns the name of an environment's parameter. `written` may be in any case.
 fn axis(written: &str, environment: &proto::Environment) -> Result<String> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
     names::find(written, known.clone()).map(|index| environment.parameters[index].name.clone()).ok_or_else(|| {
@@ -131,7 +132,7 @@ fn axis(written: &str, environment: &proto::Environment) -> Result<String> {
     })
 }
 
-/// Returns the values of --parameters.
+/// Returns the values of --parameters. Refuses more than one value of a parameter.
 fn fixed_parameters(args: &HeatmapArgs) -> Result<Context> {
     let value = |(name, values): (String, Distribution)| match values.range() {
         (low, high) if low == high => Ok((name, low)),
@@ -142,8 +143,8 @@ fn fixed_parameters(args: &HeatmapArgs) -> Result<Context> {
     sets::drawn_set(Version::D, &args.parameters)?.drawn().into_iter().map(value).collect()
 }
 
-/// Returns the default path of the files. It is in the working directory, because a training's folder has only its own
-/// files.
+/// Returns the default path of the files, without extension. It is in the working directory, and not in the training's
+/// folder, which holds only files of the training.
 fn default_path(checkpoints: &[Checkpoint], kind: &HeatmapKind) -> PathBuf {
     let TrainConfig { common, settings } = &checkpoints[0].state.config;
     let Common { environment, architecture, version, parameters, seed, .. } = common;
@@ -155,7 +156,7 @@ fn default_path(checkpoints: &[Checkpoint], kind: &HeatmapKind) -> PathBuf {
     format!("{environment}-{}-{architecture}-{version}{suffix}-s{seed}-{kind}", settings.name()).into()
 }
 
-/// Returns the options of a test of a policy with the settings `trained`.
+/// Returns the options for testing a policy that was trained with the settings `trained`.
 fn options(args: &HeatmapArgs, kind: &HeatmapKind, trained: &TrainConfig) -> HeatmapOptions {
     HeatmapOptions {
         parameters: kind.parameters.clone(),

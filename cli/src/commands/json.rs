@@ -1,4 +1,4 @@
-//! `--json`: results of commands for other programs.
+//! Option --json: writes the results of commands for other programs.
 
 use std::fs::File;
 use std::io::Write;
@@ -10,10 +10,10 @@ use serde::Serialize;
 use super::args::JsonArgs;
 use super::error::Result;
 
-/// Name of standard output.
+/// The value of --json that stands for standard output.
 const STANDARD_OUTPUT: &str = "-";
 
-/// Returns the file that `path` names; `None` for standard output.
+/// Returns `path` if it is a file, and `None` if it stands for standard output.
 fn file(path: &Path) -> Option<&Path> {
     (path != Path::new(STANDARD_OUTPUT)).then_some(path)
 }
@@ -26,17 +26,17 @@ pub(super) fn event_writer(path: &Path) -> Result<Box<dyn Write>> {
 }
 
 impl JsonArgs {
-    /// Refuses a file that cannot be written, before the command begins.
+    /// Checks that the file of --json can be written. Commands call this before their work begins.
     pub(super) fn check(&self) -> Result<()> {
         Ok(self.json.as_deref().and_then(file).map_or(Ok(()), require_writable)?)
     }
 
-    /// Tells whether standard output has JSON and nothing else.
+    /// Tells whether JSON goes to standard output, so that the command must print nothing else there.
     pub(super) fn is_printed(&self) -> bool {
         self.json.as_deref().is_some_and(|path| file(path).is_none())
     }
 
-    /// Prints or writes the document if --json is given.
+    /// If --json is given, writes the document to its file or to standard output.
     pub(super) fn write(&self, document: impl Serialize) -> Result<()> {
         match self.json.as_deref().map(file) {
             None => Ok(()),

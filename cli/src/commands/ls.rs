@@ -1,4 +1,4 @@
-//! `perturb ls`.
+//! `perturb ls`: lists trainings, experiments and assessments.
 
 use std::io::Write;
 
@@ -32,12 +32,13 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     }
     let done = |found: &RunSummary| {
         if found.unit.is_empty() {
-            // Runs that are not understood have no unit.
+            // A run whose files are damaged has no unit.
             return String::new();
         }
         let number = |number: u64| grouped(number as usize);
         format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
     };
+    // A table if it fits into the terminal, and otherwise two lines for each run.
     let table = Table::builder("", &found)
         .text("run", |found| found.path.display())
         .text("what", |found| &found.what)

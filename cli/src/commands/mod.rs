@@ -1,9 +1,9 @@
 //! The command line: `perturb envs | ls | serve | train | evaluate | compare | demo | plan | run | export | report |
 //! curves | heatmap | video | audit | rescore | completions | man`.
 //!
-//! Results go to standard output, everything else to standard error. Exit status: 0 success; 1 failure, for `audit`
-//! also a different episode; 2 an argument or file is missing or wrong, and nothing was begun; 128 + N if signal N
-//! ended it.
+//! Results go to standard output, everything else to standard error. Exit status: 0 for success; 1 for a failure, and
+//! for an `audit` that finds a different episode; 2 if an argument or file is missing or wrong, so that the command did
+//! not begin; 128 + N if signal N ended the command.
 
 mod args;
 mod audit;
@@ -49,9 +49,9 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let _ = perturb_system::ignore_sigxfsz(); // without it, only a limit of file sizes ends the program
+    let _ = perturb_system::ignore_sigxfsz(); // if it fails, the program only ends when a file exceeds the size limit
     let cli = Cli::from_process(|warning| {
-        // A program that replaces itself by perturb-recurrent has printed the warning already.
+        // `perturb` has printed the warning before it replaced itself by perturb-recurrent.
         if !recurrent::is_replacement() {
             display::say(format_args!("perturb: {warning}"));
         }
@@ -59,7 +59,7 @@ pub fn main() -> ExitCode {
     let default_filter = match (cli.quiet, cli.verbose) {
         (true, _) => Targets::new().with_default(Level::ERROR),
         (_, 0) => Targets::new().with_default(Level::WARN),
-        // Targets that begin with `perturb` are this project's; RUST_LOG can select others.
+        // Targets that begin with `perturb` belong to this project. RUST_LOG can select others.
         (_, 1) => Targets::new().with_default(Level::WARN).with_target("perturb", Level::DEBUG),
         _ => Targets::new().with_default(Level::WARN).with_target("perturb", Level::TRACE),
     };
@@ -73,7 +73,7 @@ pub fn main() -> ExitCode {
     let lines = tracing_subscriber::fmt::layer()
         .with_ansi(colours)
         .with_writer(|| AboveBar)
-        // Internal errors would go to standard error, which is what has failed, and would end the program.
+        // Internal errors of the logger mean that standard error failed. Printing them there would end the program.
         .log_internal_errors(false);
     tracing_subscriber::registry().with(lines).with(filter).init();
     PrivateServer::set_stderr_handler(display::say);
@@ -85,8 +85,8 @@ pub fn main() -> ExitCode {
             | CliCommand::Curves(_)
             | CliCommand::Serve(_)
     ) {
-        // These commands have nothing to finish. The others check a flag.
-        // Without a handler, signals end them as they end any program.
+        // Signals end these commands at once, because they have nothing to finish. The other commands check a flag. If
+        // the handler cannot be installed, signals have their default effect, which also ends the program.
         let _ = end_on_signals();
     }
     let success = |()| ExitCode::SUCCESS;
@@ -126,7 +126,7 @@ fn signal_code(number: i32) -> ExitCode {
     ExitCode::from(u8::try_from(128 + number).unwrap_or(1))
 }
 
-/// Connects to the servers that were named, or starts a private one.
+/// Connects to the servers of --server, or starts a private server.
 fn servers(args: &ServerArgs, stop: &StopFlag) -> Result<Servers> {
     check_server_args(args)?;
     let servers = if args.server.is_empty() {
@@ -139,14 +139,14 @@ fn servers(args: &ServerArgs, stop: &StopFlag) -> Result<Servers> {
     Ok(servers)
 }
 
-/// Returns [`servers`] that are waited for when they are lost.
+/// Returns [`servers`] to which the learner reconnects after a loss, for as long as `wait` permits.
 fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs, stop: &StopFlag) -> Result<Servers> {
     Ok(servers(args, stop)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// Returns the servers for `jobs` simultaneous processes: the ones that were named, which all processes share, or a
-/// private one for each process. A server's single transport thread serves all its clients, so processes with short
-/// steps would wait for each other.
+/// Returns the servers for `jobs` simultaneous processes. All processes share the servers of --server. Without it, each
+/// process gets a private server, because a server's single transport thread serves all its clients, and processes with
+/// short steps would wait for each other.
 fn servers_of_jobs(args: &ServerArgs, jobs: usize, stop: &StopFlag) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     check_server_args(args)?;
     if !args.server.is_empty() {
@@ -159,27 +159,27 @@ fn servers_of_jobs(args: &ServerArgs, jobs: usize, stop: &StopFlag) -> Result<(V
     Ok((servers, addresses))
 }
 
-/// Returns the number of physics threads for each of `jobs` private servers: one for each core, or fewer if all servers
-/// together would have more than two for each core.
+/// Returns the number of physics threads for each of `jobs` private servers: one for each core, but all servers
+/// together have at most two for each core.
 ///
-/// On two cores, two processes took the same time with one thread each and with two. The last process, which has both
-/// cores for itself, took a quarter less time with two.
+/// The limit comes from a measurement on two cores. Two simultaneous processes took the same time with one thread each
+/// and with two threads each. A process that ran alone took a quarter less time with two threads.
 fn workers_of_each(jobs: usize, cores: usize) -> usize {
     (2 * cores / jobs.max(1)).clamp(1, cores)
 }
 
-/// Returns the servers for a command that trains or tests.
+/// Returns the servers for a command that plays a policy. --act sets where actions are chosen.
 fn playing_servers(args: &PlayArgs, stop: &StopFlag) -> Result<Servers> {
     let act = if args.act == "client" { ActorLocation::Client } else { ActorLocation::Server };
     Ok(reconnecting_servers(&args.server, args.wait, stop)?.with_act(act))
 }
 
-/// Returns the plan of an experiment's folder, with the cells that its tuning has selected so far.
+/// Loads the plan in an experiment's folder, and adds the cells that its tuning has selected so far.
 fn plan_in(folder: &Folder) -> Result<Plan> {
     Ok(Plan::load(&folder.require_plan()?)?.with_selected_cells(folder)?)
 }
 
-/// Refuses servers whose models are others than those of the results in `folder`.
+/// Refuses servers whose models differ from those of the results in `folder`.
 fn check_models(servers: &Servers, plan: &Plan, folder: &Folder) -> Result<()> {
     plan.environments().into_iter().try_for_each(|name| Ok(folder.check_model(plan, &servers.environment(name)?)?))
 }
@@ -192,13 +192,13 @@ fn require_file(path: &Path, remedy: &str) -> Result<()> {
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             format!("there is no file {}", path.display())
         }
-        // Other problems are reported by whoever reads the file.
+        // Reading the file will report other problems.
         _ => return Ok(()),
     };
     Err(CommandError::Usage(format!("{wrong}: {remedy}")))
 }
 
-/// Refuses a folder for results that is a file, or below a file.
+/// Refuses a path for the folder of results if the path, or a part of it, is a file.
 fn refuse_file(out: &Path) -> Result<()> {
     let file = out.ancestors().find(|path| path.exists()).filter(|path| !path.is_dir());
     match file {
@@ -214,21 +214,21 @@ fn refuse_file(out: &Path) -> Result<()> {
     }
 }
 
-/// Refuses a default folder for results that cannot be written, for instance that of somebody else's experiment.
+/// Refuses a default folder for results that cannot be written, e.g. in the experiment of another user.
 fn require_default_out(folder: &Path) -> Result<()> {
     refuse_file(folder)?;
     perturb_files::require_writable_folder(folder)
         .map_err(|error| CommandError::Usage(format!("{error}; give another folder with --out")))
 }
 
-/// Reads the plan in an experiment file.
+/// Loads the plan from an experiment file.
 fn load_plan(path: &Path) -> Result<Plan> {
     require_file(path, "give an experiment file; docs/experiments.md describes them, and experiments/ has examples")?;
     tracing::debug!("reading the plan from {}", path.display());
     Ok(Plan::load(path)?)
 }
 
-/// Returns the number of threads of an update; by default one for each core.
+/// Returns the number of threads for policy updates; by default one for each core.
 fn threads(wanted: Option<u16>) -> usize {
     wanted.map_or_else(cores, usize::from)
 }
@@ -237,7 +237,7 @@ fn cores() -> usize {
     std::thread::available_parallelism().map_or(1, usize::from)
 }
 
-/// Refuses options of private servers together with --server, and folders that are none of a task.
+/// Refuses options of private servers together with --server, and folders of --task without a task.
 fn check_server_args(args: &ServerArgs) -> Result<()> {
     if !args.server.is_empty() {
         let given = [(args.workers.is_some(), "--workers"), (!args.task.is_empty(), "--task")];
@@ -264,7 +264,7 @@ fn check_server_args(args: &ServerArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the servers' arguments with the folders of tasks that `plan` names, unless --task or --server replaces them.
+/// Returns the servers' arguments with the task folders of `plan`, unless --task or --server is given.
 fn with_tasks_of(args: &ServerArgs, plan: &Plan) -> Result<ServerArgs> {
     if !args.server.is_empty() || !args.task.is_empty() {
         return Ok(args.clone());

@@ -1,4 +1,4 @@
-//! `perturb plan`.
+//! `perturb plan`: prints the size of an experiment, and estimates how long it takes.
 
 use std::collections::HashMap;
 use std::io::Write;
@@ -30,6 +30,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         return Err(CommandError::Usage("--json lists cells: give --cells or --unfinished-in DIR with it".into()));
     }
     args.json.check()?;
+    // List cells: all with --cells, or the unfinished ones with --unfinished-in.
     let folder = args.unfinished_in.as_deref().map(Folder::new);
     let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.with_selected_cells(folder))?;
     let listed: Vec<&Cell> = match &folder {
@@ -47,6 +48,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     if folder.is_some() {
         return Ok(());
     }
+    // Divide the cells into groups as `perturb run` would. Cells that tuning will select are included.
     let timings_from = args.timings_from.as_deref().map(Folder::new);
     timings_from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
     let known = plan.with_expected_cells(timings_from.as_ref().map(|folder| folder as &dyn CellStates))?;
@@ -59,6 +61,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     // The run itself reports servers that do not answer.
     let (servers, _) = Servers::connect_to_some(&addresses, &stop)?;
     let limits = step_limits(&servers, &known)?;
+    // Print the numbers of configurations, trainings and tests.
     let counts = plan.counts();
     writeln!(
         out,
@@ -94,7 +97,8 @@ fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> S
     format!("{cells} in {number} of {sizes_shown}, {} at a time", at_a_time.min(groups.len()))
 }
 
-/// Prints what the plan costs: from the durations of finished cells, and an upper bound by measurements for the others.
+/// Estimates and prints how long the plan takes. Durations come from finished cells of the same kind if there are any,
+/// and otherwise from measurements, which give an upper bound.
 fn estimate(
     args: &PlanArgs,
     plan: &Plan,
@@ -104,6 +108,7 @@ fn estimate(
     stop: &StopFlag,
 ) -> Result<()> {
     let mut out = output();
+    // The durations of some cells are known from finished cells of the same kind.
     let measured_seconds = |cell: &Cell| finished.and_then(|(_, timings)| timings.seconds(cell));
     let (known, unknown): (Vec<usize>, Vec<usize>) =
         (0..plan.cells.len()).partition(|&cell| measured_seconds(&plan.cells[cell]).is_some());
@@ -122,6 +127,7 @@ fn estimate(
     if args.measure == 0 && finished.is_some() && !unknown.is_empty() {
         writeln!(out, "not measured: {}", cells(unknown.len()))?;
     }
+    // The durations of the other cells are measured.
     if args.measure > 0 && !unknown.is_empty() {
         let measurements = measurements(args, plan, grouping, &unknown, servers, stop, &mut out)?;
         let estimates = estimates(plan, &measurements, limits);
@@ -144,7 +150,7 @@ fn estimate(
     Ok(())
 }
 
-/// Measures the representatives of `cells` and prints their speeds.
+/// Measures groups of cells that represent all kinds of `cells`, and prints their speeds.
 fn measurements(
     args: &PlanArgs,
     plan: &Plan,
@@ -169,7 +175,8 @@ fn measurements(
     Ok(measurements)
 }
 
-/// Returns the step limits of the plan's environments. Refuses unknown environments and plans that do not fit them.
+/// Returns the step limit of each environment of the plan. Refuses unknown environments, and plans that do not fit
+/// their environments.
 pub(super) fn step_limits<'a>(servers: &Servers, plan: &'a Plan) -> Result<HashMap<&'a str, u32>> {
     let limit = |name: &'a str| {
         let environment = servers.environment(name)?;

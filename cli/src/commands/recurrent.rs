@@ -1,6 +1,7 @@
-//! Replaces this process by `perturb-recurrent`, which is this program with libtorch.
+//! Replaces this process with `perturb-recurrent`, which is the same program with libtorch.
 //!
-//! Only the gradients of recurrent policies need libtorch, which takes most of a second to load.
+//! Only the gradients of recurrent policies need libtorch. It is a separate program because libtorch takes most of a
+//! second to load.
 
 use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
@@ -13,18 +14,18 @@ use perturb_settings::Architecture;
 
 use super::error::{CommandError, Result, system};
 
-/// Name of the program with libtorch, in the same folder as this one.
+/// Name of the program with libtorch. It is in the same folder as `perturb`.
 const PROGRAM: &str = "perturb-recurrent";
-/// Environment variable with the version of the program that started `perturb-recurrent`.
+/// Environment variable in which `perturb` passes its version to `perturb-recurrent`.
 const STARTED_BY: &str = "PERTURB_STARTED_BY";
-/// Environment variable with the number of OpenBLAS's threads. OpenBLAS reads it before `main`.
+/// Environment variable with the number of threads of OpenBLAS, which libtorch uses. OpenBLAS reads it before `main`.
 const OPENBLAS_THREADS: &str = "OPENBLAS_NUM_THREADS";
 
-/// Starts again as `perturb-recurrent`, with the same arguments and process id, if training `architecture` needs
-/// libtorch. Returns if it does not, or if this is that program.
+/// Replaces this process with `perturb-recurrent` if training `architecture` needs libtorch. The new program has the
+/// same arguments and process id. Returns if libtorch is not needed, or if this already is `perturb-recurrent`.
 ///
-/// Sets OpenBLAS to one thread, because more threads cost time with networks this small, and sums depend on their
-/// number. A value that the user has set is kept unless `one_thread` requires one thread.
+/// The new program runs OpenBLAS with one thread. More threads are slower for networks this small, and change the
+/// results of sums. If the user has set another number of threads, it is kept unless `one_thread` is true.
 ///
 /// # Errors
 /// [`CommandError::Usage`] if `perturb-recurrent` is missing or of another version.
@@ -63,28 +64,28 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
     )))
 }
 
-/// Calls [`prepare`] for the cells of a plan.
+/// Calls [`prepare`] if a cell of the plan trains a recurrent policy.
 ///
 /// # Errors
 /// See [`prepare`].
 pub(super) fn prepare_for(plan: &Plan) -> Result<()> {
     let cells = || plan.cells.iter().chain(&plan.candidates);
     let recurrent = cells().find(|cell| cell.config.common.architecture != Architecture::Ff);
-    // The results of an experiment must not depend on variables that a cluster's profile exports.
+    // One thread is required, because results must not depend on variables that a cluster sets in its shell profile.
     prepare(recurrent.map_or(Architecture::Ff, |cell| cell.config.common.architecture), true)
 }
 
-/// Sets OpenBLAS to one thread in a program that is started.
+/// Makes a command run OpenBLAS with one thread.
 pub(super) fn set_one_thread(command: &mut Command) {
     command.env(OPENBLAS_THREADS, "1");
 }
 
-/// Tells whether this process has replaced `perturb`.
+/// Tells whether this process is `perturb-recurrent` and has replaced `perturb`.
 pub(super) fn is_replacement() -> bool {
     std::env::var_os(STARTED_BY).is_some()
 }
 
-/// Returns the path of `perturb`, with which jobs start. It replaces itself where that is needed.
+/// Returns the path of `perturb`, which jobs run. It replaces itself with `perturb-recurrent` if necessary.
 pub(super) fn perturb_program() -> Result<PathBuf> {
     let program = current()?;
     Ok(if has_recurrent() { program.with_file_name("perturb") } else { program })

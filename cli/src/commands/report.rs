@@ -1,4 +1,4 @@
-//! `perturb report` and `perturb curves`.
+//! `perturb report` and `perturb curves`: tables and pictures of an experiment's results.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -25,7 +25,8 @@ pub(super) fn run(args: &ReportArgs) -> Result<()> {
     Ok(())
 }
 
-/// Writes tables and pictures, and with `page` also everything as HTML. Returns the tables as text, and their folder.
+/// Writes tables and pictures to the folder `out`, and the whole report as HTML to the file `page`. Returns the tables
+/// as text, and their folder.
 pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&Path>) -> Result<(String, PathBuf)> {
     let out = match out {
         Some(out) => out,
@@ -36,7 +37,7 @@ pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&P
         }
     };
     refuse_file(&out)?;
-    // A page inside of the tables' folder needs no check, because that folder is created.
+    // A page in the folder of the tables needs no check, because that folder will be created.
     let is_inside = |page: &Path| page.parent().is_some_and(|folder| folder.starts_with(&out));
     page.filter(|page| !is_inside(page)).map_or(Ok(()), require_writable)?;
     sources.read(|whole| {
@@ -54,7 +55,8 @@ pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&P
     })
 }
 
-/// Returns the folder report/ of the experiment. It is refused for assessments, which do not belong to the experiment.
+/// Returns the default folder of a report, which is report/ in the experiment's folder. Refuses reports with
+/// assessments, which do not belong to the experiment; --out is then required.
 fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
         let message =
@@ -63,7 +65,7 @@ fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     };
     let mut out = folder.path().join("report");
     if let Some(rule) = sources.another_rule()? {
-        // The plan's own report stays.
+        // The report by the plan's own rule is not replaced.
         out = out.join(rule.to_string());
     }
     Ok(out)

@@ -1,4 +1,4 @@
-//! `perturb rescore`.
+//! `perturb rescore`: applies other success rules to recorded test episodes.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -16,7 +16,7 @@ use super::error::{CommandError, Result};
 use super::require_file;
 use super::sets::normalize_rule;
 
-/// Remedy for a missing file.
+/// Advice in the error about a missing file.
 const REMEDY: &str = "give the --records of `perturb evaluate`, or a cell of `perturb run`";
 
 pub(super) fn run(args: &RescoreArgs) -> Result<()> {
@@ -30,6 +30,7 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
             format!("{} does not record what its episodes achieved; test again with this version", args.file.display());
         return Err(CommandError::Failed(message));
     };
+    // The success rules to apply: those of --success, or else the rule of the test.
     let criteria: Vec<Criterion> = match &args.success[..] {
         [] => vec![tested.clone()],
         rules => {
@@ -73,7 +74,7 @@ pub(super) fn run(args: &RescoreArgs) -> Result<()> {
     Ok(())
 }
 
-/// Returns the file of recorded episodes at `path`, which may be the folder that holds it.
+/// Returns the file of recorded episodes at `path`. If `path` is a folder, the file is in it.
 pub(super) fn records_file(path: &Path) -> PathBuf {
     if path.is_dir() { path.join(FILE) } else { path.to_owned() }
 }

@@ -1,4 +1,4 @@
-//! Commands in messages, for users to paste.
+//! Command lines in messages, which users can copy to resume a run.
 
 use std::path::Path;
 
@@ -14,7 +14,7 @@ pub(super) fn this_command() -> String {
     ["perturb".to_owned()].into_iter().chain(words).collect::<Vec<_>>().join(" ")
 }
 
-/// Returns the options `--task` of a command, for another command with the same environments; empty without any.
+/// Returns the options `--task` for another command that needs the same environments. The text is empty without tasks.
 pub(super) fn task_options(server: &ServerArgs) -> String {
     server.task.iter().map(|task| format!(" --task {}", quoted(task))).collect()
 }
@@ -36,7 +36,7 @@ pub(super) fn resume_command(path: &Path, play: &PlayArgs) -> String {
     command
 }
 
-/// Adds the command that resumes the run to the error of a failed training.
+/// Converts the error of a failed training. If the training can be resumed, adds the command that resumes it.
 pub(super) fn with_resume_command(error: TrainError, play: &PlayArgs) -> CommandError {
     match &error {
         TrainError::Failed { last: Some(LastCheckpoint { run, .. }), source }

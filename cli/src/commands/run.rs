@@ -1,4 +1,4 @@
-//! `perturb run`.
+//! `perturb run`: runs the cells of an experiment in worker processes.
 
 use std::collections::HashSet;
 use std::io::{BufRead, Read};
@@ -26,7 +26,7 @@ use super::error::{CommandError, Result, system};
 use super::plan::step_limits;
 use super::{check_models, cores, load_plan, recurrent, refuse_file, servers_of_jobs, slurm, with_tasks_of};
 
-/// Time for which each group of trainings runs, so that the duration of its cells can be estimated.
+/// Time for which each measured group of trainings runs, to estimate the duration of its cells.
 const MEASURE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
@@ -63,7 +63,7 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     all_cells(args, Plan { cells, candidates: Vec::new(), ..plan }, &folder, done.as_ref(), &stop)
 }
 
-/// Returns the cell with this index or id.
+/// Returns the cell whose index or id is `name`.
 fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell> {
     plan.find(name).ok_or_else(|| {
         CommandError::Usage(format!(
@@ -74,7 +74,8 @@ fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell>
     })
 }
 
-/// Runs the cells of the order on standard input, as a worker process that another one started.
+/// Runs this process as a worker: reads a job from a line of standard input, runs its cells, and writes their events to
+/// standard output.
 fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
@@ -82,6 +83,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
         .map_err(|error| CommandError::Usage(format!("the job on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
     let mut writer = EventLineWriter::new(order.cells.len(), std::io::stdout());
+    // Find the cells of the job in the plan. If one is missing, refuse the whole job.
     let plan = Plan::load(&args.plan);
     let mut orders = Vec::new();
     for JobCell { cell: id, retry } in &order.cells {
@@ -115,7 +117,7 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
     Ok(ExitCode::SUCCESS)
 }
 
-/// Raises the flag when standard input is closed.
+/// Starts a thread that raises the stop flag when standard input is closed, i.e. when the main process has ended.
 fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
     let stop = stop.clone();
     let wait = move || {
@@ -128,7 +130,7 @@ fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
     Ok(())
 }
 
-/// Runs all cells in worker processes.
+/// Runs the cells of the plan in worker processes on this machine.
 fn all_cells(
     args: &RunArgs,
     plan: Plan,
@@ -136,7 +138,7 @@ fn all_cells(
     done: Option<&DoneCells<'_>>,
     stop: &StopFlag,
 ) -> Result<ExitCode> {
-    // Workers are started from this program.
+    // Worker processes run the same program as this process.
     recurrent::prepare_for(&plan)?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let expected = without_done(plan.with_expected_cells(Some(&layered(folder, done)))?, done)?;
@@ -170,21 +172,22 @@ fn all_cells(
         runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_max_seconds(bounds))?;
     }
     if stop.signal().is_some() {
-        // No worker is left, and a server that stands still would be waited for.
+        // All workers have ended. The servers are killed, because waiting for a stuck server could take long.
         local.iter().filter_map(|server| server.lock().ok()).for_each(|mut server| server.kill());
     }
     runner.finish()
 }
 
-/// Returns the indices of the cells that a run has to run.
+/// Returns the indices of the cells that are not finished. Failed cells count as finished without --retry-failed.
 fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &Folder) -> Vec<usize> {
     let is_settled = |&cell: &usize| folder.cell(&plan.cells[cell].id).is_settled(!args.retry_failed);
     (0..plan.cells.len()).filter(|cell| !is_settled(cell)).collect()
 }
 
-/// Returns upper bounds of the cells' durations in seconds, for the estimate of the remaining time.
+/// Returns an upper bound of each cell's duration in seconds, for the estimate of the remaining time.
 ///
-/// Only cells of kinds that do not begin at once are measured. `None` stands for the others.
+/// Only cells of kinds that begin later are measured. All other cells have `None`, because the duration of their kind
+/// is known soon.
 fn upper_bounds(
     args: &RunArgs,
     servers: &Servers,
@@ -210,7 +213,8 @@ fn upper_bounds(
     let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {
         // The run itself handles the signal.
         Err(MeasureError::Stopped { .. }) => return Ok(Vec::new()),
-        // Some settings lead to numbers that are not finite, for example. The cell itself will report that.
+        // A measurement can fail because settings lead to numbers that are not finite. The cell will report that
+        // itself.
         Err(error) => {
             tracing::warn!("the remaining time will be estimated late: {error}");
             return Ok(Vec::new());
@@ -225,9 +229,10 @@ fn upper_bounds(
 
 /// Returns the command of a worker process.
 fn worker_command(args: &RunArgs, folder: &Folder, servers: &str) -> Command {
-    // All cells of a run are run by the same program, also if its file has been replaced meanwhile.
+    // This path starts the program of this process, even if its file has been replaced since.
     let mut command = Command::new("/proc/self/exe");
-    // Users may edit the given file meanwhile, so workers read the copy. With --cell the copy may be of another plan.
+    // Workers read the copy of the plan, because users may edit the original file. With --cell they read the original,
+    // because the copy may be a different plan.
     let plan = if args.cell.is_empty() { folder.plan_path() } else { args.plan.clone() };
     command.arg0("perturb").arg("run").arg(plan).arg("--out").arg(folder.path());
     command.args(["--worker", "--server", servers]);

@@ -1,4 +1,4 @@
-//! `perturb serve`.
+//! `perturb serve`: starts the live web page.
 
 use std::io::Write;
 

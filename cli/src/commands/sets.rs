@@ -1,4 +1,4 @@
-//! Sets of parameters from the command line.
+//! Test sets, parameters and success rules from the command line. Their names may be written in any case.
 
 use std::collections::BTreeMap;
 
@@ -13,10 +13,11 @@ use super::args::SetArgs;
 use super::error::{CommandError, Result};
 use super::require_file;
 
-/// Name of the set of --parameters.
+/// Name of the test set that --parameters makes.
 const PARAMETERS_SET: &str = "parameters";
 
-/// Returns the sets to test on: `versions` and the sets in `args`; all versions if there are none.
+/// Returns the sets to test on: `versions`, and the set of --parameters or --contexts. Returns all versions if there
+/// are none.
 pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>> {
     let mut versions = versions.to_vec();
     versions.sort_unstable();
@@ -37,7 +38,7 @@ pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<Test
     Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
 }
 
-/// Returns the set of `version` with these parameters replaced. Grids are refused.
+/// Returns the set of `version` in which the values of --parameters replace those of the version. Refuses grids.
 pub(super) fn drawn_set(version: Version, parameters: &[Assignment]) -> Result<TestSet> {
     if parameters.is_empty() {
         return Ok(version.into());
@@ -52,11 +53,11 @@ pub(super) fn drawn_set(version: Version, parameters: &[Assignment]) -> Result<T
     }
 }
 
-/// Returns the name of an environment's parameter, which may be written in any case. `option` names the option for the
-/// error.
+/// Returns the name of an environment's parameter. `written` may be in any case. `option` is the option's name in the
+/// error message.
 ///
 /// # Errors
-/// [`ValueError`] if there is no such parameter, with the name that was probably meant.
+/// [`ValueError`] if there is no such parameter. The message suggests a similar name.
 pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Environment) -> Result<&'a str, ValueError> {
     let all = environment.parameters.iter().chain(&environment.disturbances);
     let known = all.map(|parameter| parameter.name.as_str());
@@ -73,7 +74,7 @@ pub(super) fn parameter<'a>(option: &str, written: &str, environment: &'a Enviro
 /// Returns `values` with the parameters' names as `environment` spells them.
 ///
 /// # Errors
-/// See [`parameter`]. A parameter in two spellings is refused, too.
+/// See [`parameter`]. Also if a parameter is given twice in different spellings.
 pub(super) fn normalize<T>(
     option: &str,
     values: BTreeMap<String, T>,
@@ -91,7 +92,7 @@ pub(super) fn normalize<T>(
     Ok(normalized)
 }
 
-/// Calls [`normalize`] on a set's parameters.
+/// Calls [`normalize`] for the parameters or the contexts of a set.
 pub(super) fn normalize_set(set: TestSet, environment: &Environment) -> Result<TestSet, ValueError> {
     let TestSet { name, version, contexts } = set;
     let contexts = match contexts {
@@ -104,10 +105,10 @@ pub(super) fn normalize_set(set: TestSet, environment: &Environment) -> Result<T
     Ok(TestSet { name, version, contexts })
 }
 
-/// Returns the rule with its quantity spelled as in `text` or `code`, the criteria of an environment.
+/// Returns the rule with its quantity spelled as in `text` or `code`, the two success rules of the environment.
 ///
 /// # Errors
-/// [`ValueError`] if the environment has no such quantity, with the one that was probably meant.
+/// [`ValueError`] if neither rule has such a quantity. The message suggests a similar name.
 pub(super) fn normalize_rule(
     rule: &Rule,
     text: Option<&Criterion>,

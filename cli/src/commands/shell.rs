@@ -1,4 +1,4 @@
-//! `perturb completions` and `perturb man`.
+//! `perturb completions` and `perturb man`: shell completions and manual pages.
 
 use std::io::Write;
 

@@ -1,4 +1,4 @@
-//! `perturb run --engine slurm`.
+//! `perturb run --engine slurm`: runs the cells of an experiment in Slurm jobs.
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -18,18 +18,18 @@ use super::error::{Result, system};
 use super::plan::step_limits;
 use super::{check_models, check_server_args, recurrent, servers_of_jobs, with_tasks_of};
 
-/// Time for which each group of trainings runs, so that the duration of its cells can be estimated.
+/// Time for which each measured group of trainings runs, to estimate the duration of its cells.
 const MEASURE_TIME: Duration = Duration::from_secs(2);
-/// Time between two requests to Slurm, whose controller serves other users, too.
+/// Time between two requests to Slurm's controller. It is long, because the controller serves all users of the cluster.
 const QUEUE_INTERVAL: Duration = Duration::from_secs(15);
 
 pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop: &StopFlag) -> Result<ExitCode> {
-    // The durations of cells are measured in this process.
+    // This process measures the durations of cells, so it needs libtorch for recurrent policies.
     recurrent::prepare_for(&plan)?;
     let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
     let folder = Folder::new(&path);
     check_server_args(&args.server)?;
-    // Also beside --server: the private servers that check the plan here need the tasks, too.
+    // The tasks are needed even with --server, because private servers check the plan on this machine.
     let ServerArgs { task, .. } = with_tasks_of(&ServerArgs { server: Vec::new(), ..args.server.clone() }, &plan)?;
     let absolute = |folder: &PathBuf| std::path::absolute(folder).map_err(system("find the absolute path of --task"));
     let tasks = task.iter().map(absolute).collect::<Result<Vec<_>>>()?;
@@ -37,8 +37,8 @@ pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop
     options.check(&path)?;
     let slurm = Slurm::default();
     slurm.check(stop)?;
-    // Environments and durations are checked here with private servers like those of a job, because the servers that
-    // jobs share may be unreachable from this machine.
+    // A private server checks the environments, because the servers of --server, which jobs share, may be unreachable
+    // from this machine.
     let checking = Servers::local(args.server.workers, &tasks, stop)?;
     step_limits(&checking, &plan)?;
     check_models(&checking, &plan, &folder)?;
@@ -80,7 +80,7 @@ fn options(args: &RunArgs, tasks: Vec<PathBuf>) -> Result<SlurmOptions> {
     })
 }
 
-/// Returns an upper bound of each cell's duration in seconds, from a short measurement on this machine.
+/// Returns an upper bound of each cell's duration in seconds, from short measurements on this machine.
 fn cell_seconds(servers: &Servers, plan: &Plan, grouping: Grouping, stop: &StopFlag) -> Result<Vec<f64>> {
     let all: Vec<usize> = (0..plan.cells.len()).collect();
     let groups = benchmark_cells(plan, &all, grouping);

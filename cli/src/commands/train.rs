@@ -1,4 +1,4 @@
-//! `perturb train`.
+//! `perturb train`: trains a policy.
 
 mod outcome;
 mod resume;
@@ -28,7 +28,7 @@ pub(super) fn run(args: &TrainArgs) -> Result<ExitCode> {
     }
 }
 
-/// Begins a new run.
+/// Begins a new training.
 fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     if args.extend.is_some() {
         let message = "--extend is for an existing run: give --resume DIR with it, or --episodes for a new run";
@@ -62,7 +62,7 @@ fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     outcome::finish(args, &config, &directory, outcome)
 }
 
-/// Creates a new folder for a run without --out. Runs that begin in the same second get different folders.
+/// Creates the folder of a training without --out. Trainings that begin in the same second get different folders.
 fn create_default_directory(config: &TrainConfig) -> Result<PathBuf> {
     let runs = Path::new("runs");
     require_default_out(runs)?;
@@ -79,7 +79,7 @@ fn create_default_directory(config: &TrainConfig) -> Result<PathBuf> {
     unreachable!("there is a number for each run")
 }
 
-/// Returns the settings that options give.
+/// Returns the settings that are given by options.
 fn flags(args: &TrainArgs) -> Result<Table> {
     let text = |value: &Option<String>| value.clone().map(Value::String);
     let number = |name: &str, value: Option<u64>| {

@@ -1,4 +1,4 @@
-//! `perturb video`.
+//! `perturb video`: films a policy.
 
 use std::io::Write;
 
@@ -12,7 +12,8 @@ use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
 
-/// Maximum number of frames of an episode that are drawn for a contact sheet. Drawing a robot takes some 60 ms.
+/// Maximum number of frames that are drawn of each episode for a contact sheet. It limits the time of drawing, about 60
+/// ms for each frame of a robot.
 const MAX_SHEET_FRAMES: u32 = 500;
 
 pub(super) fn run(args: &VideoArgs) -> Result<()> {
@@ -47,6 +48,7 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     if let Some(sentence) = footage.thinning() {
         note(sentence);
     }
+    // Print a table with the filmed episodes.
     let mut out = output();
     let episodes: Vec<_> = footage.episodes.iter().enumerate().collect();
     let table = Table::builder("", &episodes)
@@ -64,12 +66,12 @@ pub(super) fn run(args: &VideoArgs) -> Result<()> {
     Ok(writeln!(out, "{}: {summary}", args.out.display())?)
 }
 
-/// Describes a contact sheet.
+/// Returns a text with the number of frames and the size of a contact sheet.
 fn sheet_summary(Footage { frames, size: (width, height), .. }: &Footage) -> String {
     format!("moments out of {frames} frames, on {width} × {height} pixels")
 }
 
-/// Describes a film: its frames, its speed, and how fast it was made.
+/// Returns a text with the frames, the size and the speed of a film, and how fast it was made.
 fn film_summary(footage: &Footage) -> String {
     let Footage { frames, size: (width, height), speed, total, waiting, writing, .. } = footage;
     let milliseconds = |time: &std::time::Duration| 1e3 * time.as_secs_f64() / *frames as f64;

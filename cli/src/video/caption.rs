@@ -23,10 +23,10 @@ const DIM_TEXT: RGBColor = RGBColor(168, 172, 180);
 const SUCCESS: RGBColor = RGBColor(0, 158, 115);
 const NO_SUCCESS: RGBColor = RGBColor(213, 94, 0);
 
-/// A line of text: its left and its right part.
+/// A line of the caption: the text on its left side, and the text on its right side.
 type CaptionLine = (String, String);
 
-/// The end of an episode.
+/// The outcome at the end of an episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct ShownEnding {
     pub(super) success: bool,
@@ -43,7 +43,7 @@ impl ShownEnding {
     }
 }
 
-/// Contents of the caption that change from frame to frame.
+/// The texts and numbers of the caption that change from frame to frame.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub(super) struct CaptionText {
     /// Number of the episode, e.g. "episode 1 of 3".
@@ -53,16 +53,17 @@ pub(super) struct CaptionText {
     pub(super) step: u32,
     /// Simulated time, in seconds.
     pub(super) time: f64,
-    /// Sum of the rewards so far.
+    /// Undiscounted sum of the rewards so far.
     pub(super) episode_return: f64,
-    /// End of the episode; `None` before it.
+    /// Outcome of the episode; `None` before its end.
     pub(super) ending: Option<ShownEnding>,
-    /// Achieved value of the quantity that decides about success, e.g. "distance 20.3 m". Empty before the end, and if
-    /// there is none.
+    /// Final value of the quantity that decides about success, e.g. "distance 20.3 m". Empty before the end, and for
+    /// environments without such a quantity.
     pub(super) achieved: String,
 }
 
-/// Composes frames of a picture and the caption below it. Width and height of a frame are even, as H.264 requires.
+/// Composes frames that consist of a picture and a caption below it. Width and height of a frame are even, because
+/// H.264 requires that.
 pub(super) struct Caption {
     /// Width and height of the picture, in pixels.
     picture: (u32, u32),
@@ -75,8 +76,8 @@ pub(super) struct Caption {
 }
 
 impl Caption {
-    /// Makes the caption for pictures of `width` and `height`, of an environment with this number of `parameters`.
-    /// `title` is the first line, and `rule` describes the success rule.
+    /// Makes the caption for pictures of `width` and `height` in pixels. `title` is its first line, `rule` describes
+    /// the success rule, and `parameters` is the number of the environment's parameters.
     pub(super) fn new(
         (width, height): (u32, u32),
         title: CaptionLine,
@@ -96,7 +97,7 @@ impl Caption {
         self.frame
     }
 
-    /// Writes the frame `[height, width, 3]`.
+    /// Composes a frame of `picture` and the caption with `text`. Writes its pixels `[height, width, 3]` to `frame`.
     pub(super) fn compose(
         &self,
         picture: &RenderedPicture,
@@ -118,6 +119,8 @@ impl Caption {
         Ok(self.write(&mut frame[below..], text)?)
     }
 
+    /// Draws the lines of the caption into its pixels, and a coloured badge with the outcome after the end of an
+    /// episode.
     fn write(&self, caption: &mut [u8], text: &CaptionText) -> Result<(), PlotError> {
         let width = self.frame.0 as i32;
         let height = self.frame.1 - self.picture.1;

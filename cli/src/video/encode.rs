@@ -1,16 +1,16 @@
-//! The interface of the encoders of all formats.
+//! The interface that the encoders of all video formats implement.
 
-/// Encodes frames to a file.
+/// An encoder that writes frames to a file.
 pub(super) trait Encode {
     /// Returns the width and height of the whole picture, in pixels.
     fn size(&self) -> (u32, u32);
 
-    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`.
+    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`, and at least for one frame's time.
     fn write(&mut self, frame: &[u8], seconds: f64) -> std::io::Result<()>;
 
     /// Marks the end of an episode.
     fn end_episode(&mut self) {}
 
-    /// Completes the file. Returns n if it shows every n-th frame; 1 if it shows all.
+    /// Completes the file. Returns n if the file shows every n-th frame, i.e. 1 if it shows all frames.
     fn finish(self: Box<Self>) -> std::io::Result<u16>;
 }

@@ -1,4 +1,4 @@
-//! The file of a video. It appears when it is complete.
+//! The file of a video. It gets its name only when it is complete.
 
 use std::path::{Path, PathBuf};
 
@@ -23,7 +23,7 @@ pub enum Format {
 }
 
 impl Format {
-    /// Returns the format for the extension of `path`, in upper or lower case.
+    /// Returns the format for the extension of `path`. The extension may be in upper or lower case.
     ///
     /// # Errors
     /// [`VideoError::Extension`].
@@ -38,7 +38,8 @@ impl Format {
     }
 }
 
-/// A video that will be written. It is a hidden file in the same folder until it is complete, and deleted otherwise.
+/// The file of a video before encoding begins. The video is written to a hidden temporary file in the same folder,
+/// which is deleted if the video is not completed.
 #[derive(Debug)]
 pub struct VideoFile {
     path: PathBuf,
@@ -47,7 +48,8 @@ pub struct VideoFile {
 }
 
 impl VideoFile {
-    /// Checks that `path` can be written before any episode is played. An existing video is replaced at the end.
+    /// Checks that `path` can be written, and creates the temporary file. [`VideoWriter::finish`] replaces an existing
+    /// video.
     ///
     /// # Errors
     /// [`VideoError::Extension`], [`VideoError::NoFfmpeg`] and [`VideoError::File`].
@@ -61,7 +63,8 @@ impl VideoFile {
         Ok(Self { path: path.to_owned(), format, temporary })
     }
 
-    /// Returns how long a frame is shown at `fps` frames per second, in seconds.
+    /// Returns the time for which a frame is shown at `fps` frames per second, in seconds. A GIF rounds it to
+    /// hundredths.
     pub fn frame_seconds(&self, fps: f64) -> f64 {
         match self.format {
             Format::Gif => f64::from(gif::delay(1.0 / fps)) / 100.0,
@@ -70,8 +73,8 @@ impl VideoFile {
     }
 
     /// Begins to encode frames of `size`: width and height in pixels, both even. Each frame is shown for 1 / `fps`
-    /// seconds or a whole multiple of it; in a GIF for whole hundredths of a second. A contact sheet has a place for
-    /// each episode of `grid`.
+    /// seconds or a whole multiple of that time. A GIF rounds the time to hundredths of a second. `grid` has the
+    /// numbers of sets and episodes that a contact sheet will show.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
@@ -87,9 +90,9 @@ impl VideoFile {
     }
 }
 
-/// A video during encoding.
+/// A video that is being encoded.
 pub struct VideoWriter {
-    // Fields are dropped in this order: the encoder must go before the file that it writes to.
+    // Fields are dropped in this order. The encoder must be dropped before the file that it writes to.
     encoder: Box<dyn Encode>,
     file: VideoFile,
 }
@@ -100,7 +103,7 @@ impl VideoWriter {
         self.encoder.size()
     }
 
-    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`, at least one frame's time.
+    /// Adds a frame `[height, width, 3]` that is shown for about `seconds`, and at least for one frame's time.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
@@ -108,15 +111,16 @@ impl VideoWriter {
         self.encoder.write(frame, seconds).map_err(encoding(&self.file.path))
     }
 
-    /// Marks the frames since the last call as an episode.
+    /// Marks the end of an episode, which consists of the frames since the last call.
     pub fn end_episode(&mut self) {
         self.encoder.end_episode();
     }
 
-    /// Completes the video and moves it to its path. Returns n if it shows every n-th frame; 1 if it shows all.
+    /// Completes the video and moves it to its path. Returns n if it shows every n-th frame, i.e. 1 if it shows all
+    /// frames.
     ///
     /// # Errors
-    /// [`VideoError::Encode`] and [`VideoError::File`]. An existing video is kept then.
+    /// [`VideoError::Encode`] and [`VideoError::File`]. After an error, an existing video is unchanged.
     pub fn finish(self) -> Result<u16, VideoError> {
         let VideoFile { path, temporary, .. } = self.file;
         let shown_every = self.encoder.finish().map_err(encoding(&path))?;

@@ -14,7 +14,7 @@ use perturb_settings::sets::TestSet;
 use super::caption::{Caption, CaptionText, ShownEnding, parameter};
 use super::{EpisodeGrid, VideoError, VideoFile, VideoWriter};
 
-/// Time that the last frame of an episode is shown, in seconds.
+/// Time for which the last frame of an episode is shown, in seconds.
 const LAST_FRAME_SECONDS: f64 = 2.0;
 
 /// Options of a film.
@@ -26,18 +26,18 @@ pub struct VideoOptions {
     pub episodes: u64,
     /// Random seed.
     pub seed: u64,
-    /// Width and height of the pictures, within [`super::PIXELS`]. Frames are higher by the text below.
+    /// Width and height of the pictures in pixels, within [`super::PIXELS`]. Frames also have the caption below.
     pub size: (u32, u32),
     /// Frames per second, more than 0; `None` for real time.
     pub fps: Option<f64>,
-    /// Steps between two frames, at least 1. The first and the last state are always shown.
+    /// Number of steps between two frames, at least 1. The first and the last state of an episode are always shown.
     pub every: u32,
 }
 
-/// Figures of a filmed episode.
+/// The parameters and the outcome of a filmed episode.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Filmed {
-    /// Name of the set that its parameters are from.
+    /// Name of the set that the parameters come from.
     pub set: String,
     /// Names and values of the parameters, in the catalogue's order.
     pub parameters: Vec<(String, f64)>,
@@ -45,18 +45,18 @@ pub struct Filmed {
     pub episode_return: f64,
     /// Number of steps.
     pub length: u32,
-    /// Whether it was a success.
+    /// Whether the episode was a success.
     pub success: bool,
 }
 
-/// Figures of a finished film.
+/// The result of filming: the episodes, and the properties of the video.
 #[derive(Clone, Debug, Default)]
 pub struct Footage {
-    /// Episodes in order: of the first set, of the second set, …
+    /// The filmed episodes: all of the first set, then all of the second set, and so on.
     pub episodes: Vec<Filmed>,
     /// Number of frames: one for each shown step, and one for each episode's start.
     pub frames: u64,
-    /// The video shows every n-th frame; 1 if it shows all.
+    /// n if the video shows every n-th frame, i.e. 1 if it shows all frames.
     pub shown_every: u16,
     /// Width and height of the video, in pixels.
     pub size: (u32, u32),
@@ -64,14 +64,14 @@ pub struct Footage {
     pub speed: f64,
     /// Time from the first request to the finished file.
     pub total: Duration,
-    /// Time of waiting for the server.
+    /// Part of `total` that was spent waiting for the server.
     pub waiting: Duration,
-    /// Time of drawing text, encoding and writing.
+    /// Part of `total` that was spent drawing captions, encoding and writing.
     pub writing: Duration,
 }
 
 impl Footage {
-    /// Returns a sentence about a video that does not show all frames.
+    /// Returns a note for the user if the video does not show all frames.
     pub fn thinning(&self) -> Option<String> {
         (self.shown_every > 1).then(|| {
             format!(
@@ -83,15 +83,15 @@ impl Footage {
     }
 }
 
-/// Plays `options.episodes` episodes on each set and writes them to `file`: a frame of each episode's start, and one
-/// after each shown step. The policy of `checkpoint` samples its actions and does not update its statistics. Calls
-/// `report` with the number of finished episodes.
+/// Plays `options.episodes` episodes on each set and writes them to `file`: a frame of each episode's start, and a
+/// frame after each shown step. The policy of `checkpoint` samples its actions, and its normalisers do not change.
+/// Calls `report` with the number of finished episodes.
 ///
-/// The film shows environment 0 of a test with the same seed, so a film of one episode shows what a test of one episode
-/// plays. A policy that was trained in trials keeps its memory during a trial. All episodes of the trial are filmed.
+/// The film shows environment 0 of a test with the same seed, so a film of one episode shows the episode of a test with
+/// one episode. An RL² policy keeps its memory during a trial, and all episodes of the trial are filmed.
 ///
 /// # Errors
-/// [`VideoError`]. No file is left then.
+/// [`VideoError`]. After an error, no file is left.
 pub fn film(
     servers: &Servers,
     checkpoint: &Checkpoint,
@@ -118,7 +118,7 @@ pub fn film(
     Ok(footage)
 }
 
-/// Output of the frames. Their size is known at the first film.
+/// The output of the frames. Encoding begins with the first film, because the size of frames is not known before.
 enum FilmOutput {
     Empty(VideoFile),
     Begun(VideoWriter),
@@ -138,7 +138,7 @@ impl FilmOutput {
     }
 }
 
-/// The request after a state.
+/// The request that follows a state.
 enum NextRequest {
     Step,
     Episode,
@@ -149,7 +149,7 @@ enum NextRequest {
 struct Film<'a> {
     options: &'a VideoOptions,
     set: &'a TestSet,
-    /// Number of episodes of the previous sets.
+    /// Number of episodes that were filmed on earlier sets.
     before: usize,
     state: &'a State,
     single: RenderSession<'a>,
@@ -160,9 +160,9 @@ struct Film<'a> {
     begun: BegunEpisode,
     caption: Caption,
     caption_text: CaptionText,
-    /// Whether a picture of the current state was requested, and of the next state.
+    /// Whether a picture was requested of the current state, and of the next state.
     pictured: [bool; 2],
-    /// Last picture.
+    /// The last picture that was received.
     last: Option<RenderedPicture>,
     frame: Vec<u8>,
     fps: f64,
@@ -218,6 +218,7 @@ impl<'a> Film<'a> {
         Ok(film)
     }
 
+    /// Plays and films all episodes on the set.
     fn run(
         &mut self,
         writer: &mut VideoWriter,
@@ -241,12 +242,12 @@ impl<'a> Film<'a> {
         }
     }
 
-    /// Returns the number of episodes on this set.
+    /// Returns the number of finished episodes on this set.
     fn episodes(&self) -> usize {
         self.footage.episodes.len() - self.before
     }
 
-    /// Returns the simulated time of a frame, in seconds.
+    /// Returns the simulated time between two frames, in seconds.
     fn frame_seconds(&self) -> f64 {
         f64::from(self.options.every) * self.environment.control_timestep
     }
@@ -276,7 +277,7 @@ impl<'a> Film<'a> {
         Ok(self.single.request_picture(width, height)?)
     }
 
-    /// Receives the picture of the current state, if one was requested, and writes its frame.
+    /// Receives the picture of the current state, if one was requested, and writes a frame.
     fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
         if !self.pictured[0] {
             return Ok(());
@@ -332,7 +333,7 @@ impl<'a> Film<'a> {
             success: end.success,
         });
         if !self.pictured[0] {
-            // No other request is under way.
+            // The next request was not sent yet, so the picture is still of this state.
             self.request_picture()?;
             self.pictured[0] = true;
         }

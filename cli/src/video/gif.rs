@@ -13,23 +13,23 @@ use super::palette::{Palette, UNCHANGED};
 const MAX_BYTES: usize = 2_000_000;
 /// Minimum delay of a frame, in hundredths of a second. Many programs show shorter delays much slower.
 const MIN_DELAY: f64 = 2.0;
-/// Numbers n of films that show every n-th frame. The film with the most frames that fits is written.
+/// Numbers n for films that show every n-th frame. The smallest n whose film fits into [`MAX_BYTES`] is used.
 const STRIDES: [u16; 19] = [1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 24, 32, 64, 128, 256, 512, 1024, 4096, 16_384];
-/// Bytes of a file without frames: screen, 256 colours, repetition and end.
+/// Number of bytes of a file without frames: screen descriptor, 256 colours, repetition and end.
 const FILE_OVERHEAD_BYTES: usize = 13 + 3 * 256 + 19 + 1;
-/// Bytes of a frame other than its data: delay, position and end.
+/// Number of bytes of a frame in addition to its pixels: delay, position and end.
 const FRAME_OVERHEAD_BYTES: usize = 8 + 10 + 2;
 
-/// Returns the delay of a frame that should be shown for `seconds`, in whole hundredths of a second.
+/// Returns the GIF delay of a frame that is shown for `seconds`. The unit is hundredths of a second.
 pub(super) fn delay(seconds: f64) -> u16 {
     (100.0 * seconds).round().clamp(MIN_DELAY, f64::from(u16::MAX)) as u16
 }
 
-/// Writes a GIF of at most [`MAX_BYTES`] that repeats for ever.
+/// An encoder that writes a GIF of at most [`MAX_BYTES`]. The GIF repeats endlessly.
 ///
-/// The number of frames that fit is known only at the end. So several films are encoded at once, each with fewer
-/// frames. Films that become too large are dropped, and the one with the most frames is written. Each film takes the
-/// memory of a whole GIF and of a frame.
+/// The number of frames that fit is not known before the end. So the encoder makes several films at the same time,
+/// which show every n-th frame for different n. It drops a film that becomes too large, and writes the remaining film
+/// with the most frames. Each film needs the memory of a whole GIF and of a frame.
 pub(super) struct GifEncoder {
     file: File,
     size: (u16, u16),
@@ -49,8 +49,8 @@ impl GifEncoder {
         };
         let size = (fits(width)?, fits(height)?);
         let seconds = 1.0 / fps;
-        // The delay of a shown frame includes that of the skipped frames after it, and must fit into 16 bits. Half of
-        // the range stays free, because the last frame of an episode may come in between.
+        // The delay of a shown frame includes the delays of the skipped frames after it, and must fit into 16 bits.
+        // Half of the range is reserved for the longer delay of an episode's last frame.
         let fits =
             |stride: &u16| *stride == 1 || u32::from(*stride) * u32::from(delay(seconds)) <= u32::from(u16::MAX / 2);
         let films = STRIDES.into_iter().filter(fits).map(|stride| ThinnedFilm::new(stride, delay(seconds))).collect();
@@ -104,9 +104,9 @@ impl Encode for GifEncoder {
 /// A film that shows every `stride`-th frame.
 struct ThinnedFilm {
     stride: u16,
-    /// Time between shown frames, in hundredths of a second. Last frames of episodes are shown, too.
+    /// Time between two shown frames, in hundredths of a second. The last frame of an episode is shown in any case.
     interval: u64,
-    /// Duration of a frame other than the last one of an episode, in hundredths of a second.
+    /// Duration of a normal frame, in hundredths of a second. The last frame of an episode is shown longer.
     frame_delay: u16,
     /// Compressed frames.
     frames: Vec<Frame<'static>>,
@@ -129,7 +129,8 @@ impl ThinnedFilm {
         }
     }
 
-    /// Adds a frame that is shown from `time` on, or extends the frame before it.
+    /// Adds a frame that begins at `time`. If the film skips this frame, the frame before it is shown for longer. Times
+    /// are in hundredths of a second.
     fn add(&mut self, indices: &[u8], width: usize, time: u64, delay: u16) {
         if delay > self.frame_delay || time.next_multiple_of(self.interval) < time + u64::from(delay) {
             let frame = changed_rectangle(&mut self.visible, indices, width);
@@ -142,10 +143,10 @@ impl ThinnedFilm {
     }
 }
 
-/// Returns the compressed rectangle of the pixels that differ between `visible` and `indices`, and updates `visible`. At
-/// first `visible` is empty.
+/// Returns a compressed frame of the smallest rectangle that contains all pixels in which `visible` and `indices`
+/// differ. Updates `visible`, which is empty before the first frame.
 fn changed_rectangle(visible: &mut Vec<u8>, indices: &[u8], width: usize) -> Frame<'static> {
-    visible.resize(indices.len(), UNCHANGED); // no pixel has this index
+    visible.resize(indices.len(), UNCHANGED); // no pixel of `indices` has this value, so all differ from it
     let mut left = width;
     let mut right = 0;
     let mut top = usize::MAX;
@@ -158,7 +159,7 @@ fn changed_rectangle(visible: &mut Vec<u8>, indices: &[u8], width: usize) -> Fra
         (top, bottom) = (top.min(row), row + 1);
     }
     if bottom == 0 {
-        (left, right, top, bottom) = (0, 1, 0, 1); // a frame must have a pixel
+        (left, right, top, bottom) = (0, 1, 0, 1); // a frame must have at least one pixel
     }
     let mut buffer = Vec::with_capacity((right - left) * (bottom - top));
     for row in top..bottom {
@@ -178,7 +179,7 @@ fn changed_rectangle(visible: &mut Vec<u8>, indices: &[u8], width: usize) -> Fra
         ..Frame::default()
     };
     frame.make_lzw_pre_encoded();
-    frame.buffer.to_mut().shrink_to_fit(); // the buffer was made for half of the pixels
+    frame.buffer.to_mut().shrink_to_fit(); // its capacity is half the number of pixels
     frame
 }
 

@@ -1,7 +1,8 @@
 //! Videos of a policy: `perturb video`.
 //!
-//! [`film`] plays the episodes and requests a picture of each shown state. `caption` writes the episode's figures below
-//! it. [`VideoFile`] writes the frames with one of the encoders `gif`, which has a `palette`, `mp4` and `sheet`.
+//! [`film`] plays the episodes and requests a picture of each shown state. `caption` adds the episode's numbers below
+//! each picture. [`VideoFile`] writes the frames with one of the encoders `gif` (with its `palette`), `mp4` and
+//! `sheet`.
 
 mod caption;
 mod encode;
@@ -23,12 +24,12 @@ use perturb_files::FileError;
 use perturb_learner::evaluation::TestError;
 use perturb_report::plot::PlotError;
 
-/// A video cannot be made.
+/// The reason why a video cannot be made.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum VideoError {
-    /// The policy cannot act or the server cannot draw.
+    /// The policy cannot act, or the server cannot draw.
     #[error(transparent)]
     Test(#[from] TestError),
     /// The file's name has no known extension.
@@ -40,7 +41,7 @@ pub enum VideoError {
          `apt-get install ffmpeg`, or write a .gif, which needs nothing"
     )]
     NoFfmpeg {
-        /// Result of calling it.
+        /// Why ffmpeg cannot be used.
         reason: String,
     },
     /// The operating system refused a file.

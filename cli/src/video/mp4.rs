@@ -10,7 +10,8 @@ use super::VideoError;
 use super::encode::Encode;
 
 const PROGRAM: &str = "ffmpeg";
-/// Constant rate factor. Lower values are better and larger; text stays readable at this value.
+/// The encoder's constant rate factor. A lower value gives better quality and a larger file. Text is readable at this
+/// value.
 const QUALITY: &str = "20";
 
 /// Checks that ffmpeg is installed and has an encoder for H.264.
@@ -29,10 +30,11 @@ pub(super) fn find_ffmpeg() -> Result<(), VideoError> {
     Err(VideoError::NoFfmpeg { reason: format!("this `{PROGRAM}` has none") })
 }
 
-/// Sends frames to an ffmpeg process, which is ended when this value is dropped.
+/// An encoder that sends frames to an ffmpeg process. Dropping it ends the process.
 pub(super) struct Mp4Encoder {
     child: Child,
-    /// Standard error of ffmpeg. It is a file, since nobody would read a pipe while frames are written.
+    /// Standard error of ffmpeg. It is a file and not a pipe, because a pipe would not be read while frames are
+    /// written.
     words: File,
     size: (u32, u32),
     fps: f64,
@@ -63,7 +65,7 @@ impl Mp4Encoder {
         Ok(Self { child, words, size, fps })
     }
 
-    /// Returns the reason why ffmpeg ended.
+    /// Waits for the end of ffmpeg, and returns an error with its exit status and messages.
     fn failure(&mut self) -> io::Error {
         drop(self.child.stdin.take());
         let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
@@ -82,7 +84,7 @@ impl Encode for Mp4Encoder {
     }
 
     fn write(&mut self, frame: &[u8], seconds: f64) -> io::Result<()> {
-        // All frames of H.264 have the same duration. Repeated frames take almost no space.
+        // A video has a fixed duration per frame, so a longer frame is repeated. Repeated frames take almost no space.
         for _ in 0..((seconds * self.fps).round() as u64).max(1) {
             let written = self.child.stdin.as_mut().map_or(Ok(()), |pipe| pipe.write_all(frame));
             if written.is_err() {

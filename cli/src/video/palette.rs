@@ -1,30 +1,32 @@
-//! The palette of a GIF. All frames share it, so that unchanged pixels keep their colour.
+//! The colour palette of a GIF. All frames share it, so that unchanged pixels keep their colour.
 
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-/// Index of unchanged pixels. It is the first one, so that few colours take few bits.
+/// The palette index that marks a pixel as unchanged since the last frame. It is 0, so that indices are small numbers.
 pub(super) const UNCHANGED: u8 = 0;
-/// Maximum number of colours. A GIF has 256 indices, of which one is [`UNCHANGED`].
+/// Maximum number of colours. A GIF has 256 indices, and one is [`UNCHANGED`].
 const MAX_COLOURS: usize = 255;
-/// Number of colours that are learned from the first frame. The others are for later frames.
+/// Maximum number of colours that are chosen from the first frame. The rest of the palette is for colours of later
+/// frames.
 const FIRST_FRAME_COLOURS: usize = 128;
-/// Minimum Euclidean distance of a new colour from all others, in the space of red, green and blue from 0 to 255. It grows
-/// when few colours can still be added.
+/// Minimum distance between a new colour of a later frame and all colours of the palette. Distances are Euclidean, with
+/// red, green and blue from 0 to 255. The minimum grows as the palette fills up.
 const MIN_NEW_DISTANCE: u32 = 16;
 
 type PixelColour = [u8; 3];
 
-/// Up to 255 colours, with the nearest of them for every colour.
+/// A palette of up to 255 colours. It maps every colour to its nearest colour in the palette.
 pub(super) struct Palette {
     colours: Vec<PixelColour>,
-    /// Index of each colour that was used, by its 24 bits; 0 for the others. Untouched zeros take no memory.
+    /// The palette index of each colour that was looked up before; 0 for all others. Positions are the 24 bits of a
+    /// colour. Zeros that were never written take no memory.
     met: Vec<u8>,
 }
 
 impl Palette {
-    /// Makes the palette of a frame `[height, width, 3]`: all its colours if there are few, else colours near to all of
-    /// them. They are nearer to colours of many pixels, such as the sky.
+    /// Makes a palette from the first frame, `[height, width, 3]`. It has all colours of the frame if they are few
+    /// enough, and otherwise a selection. The selection is finer near colours of many pixels, such as the sky.
     pub(super) fn learn(frame: &[u8]) -> Self {
         let mut counts = HashMap::new();
         for colour in frame.as_chunks().0 {
@@ -36,13 +38,13 @@ impl Palette {
         Self { colours, met: vec![UNCHANGED; 1 << 24] }
     }
 
-    /// Returns red, green and blue of each index.
+    /// Returns the red, green and blue value of each palette index.
     pub(super) fn bytes(&self) -> Vec<u8> {
         let unchanged = [0; 3];
         std::iter::once(&unchanged).chain(&self.colours).flatten().copied().collect()
     }
 
-    /// Writes the index of each pixel of a frame `[height, width, 3]`.
+    /// Writes the palette index of each pixel of a frame, `[height, width, 3]`, to `indices`.
     pub(super) fn indices(&mut self, frame: &[u8], indices: &mut Vec<u8>) {
         indices.clear();
         indices.extend(frame.as_chunks().0.iter().map(|&colour| {
@@ -71,8 +73,10 @@ impl Palette {
     }
 }
 
-/// Selects colours that are at least `apart`; colours of 16 pixels and more only half as far. Returns `None` if there
-/// are too many.
+/// Selects colours from `all`, pairs of a colour and its number of pixels. A colour with one pixel is selected if its
+/// distance from all selected colours is at least `apart`. The required distance shrinks with the fourth root of the
+/// number of pixels, so it is half as large for 16 pixels. Returns `None` if more than [`FIRST_FRAME_COLOURS`] are
+/// selected.
 fn spread(all: &[(PixelColour, u32)], apart: u64) -> Option<Vec<PixelColour>> {
     let mut colours: Vec<PixelColour> = Vec::new();
     for &(colour, count) in all {
@@ -88,7 +92,7 @@ fn spread(all: &[(PixelColour, u32)], apart: u64) -> Option<Vec<PixelColour>> {
     Some(colours)
 }
 
-/// Returns the squared distance.
+/// Returns the squared Euclidean distance between two colours.
 fn distance(a: PixelColour, b: PixelColour) -> u32 {
     a.iter().zip(b).map(|(&a, b)| u32::from(a.abs_diff(b)).pow(2)).sum()
 }

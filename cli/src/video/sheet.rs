@@ -1,4 +1,4 @@
-//! Encodes episodes as a contact sheet: one picture with a few moments of each episode.
+//! Encodes episodes as a contact sheet: one picture with a few frames of each episode.
 
 use std::fs::File;
 use std::io::{self, BufWriter};
@@ -6,41 +6,41 @@ use std::path::{Path, PathBuf};
 
 use super::encode::Encode;
 
-/// Number of pictures in a row, which all sets of parameters share.
+/// Number of pictures in a row of the sheet. The sets of parameters are side by side and share the row.
 const PICTURES_PER_ROW: usize = 6;
 /// Minimum number of pictures of an episode: its start and its end.
 const MIN_PICTURES: usize = 2;
-/// Maximum number of frames of an episode in memory. When it is exceeded, every second one is dropped.
+/// Maximum number of frames of an episode in memory. When it is exceeded, every second frame is dropped.
 const MAX_FRAMES: usize = 64;
-/// Distance between the pictures of an episode, in pixels.
+/// Horizontal distance between the pictures of an episode, in pixels.
 const PICTURE_GAP: usize = 2;
-/// Distance between sets, in pixels.
+/// Horizontal distance between two sets, in pixels.
 const SET_GAP: usize = 8;
-/// Maximum size of a sheet in memory: 256 MiB.
+/// Maximum size of a sheet in memory, in bytes: 256 MiB.
 const MAX_BYTES: usize = 1 << 28;
 
-/// Numbers of sets and episodes of a film.
+/// The layout of a contact sheet: a column for each set of parameters, and a row for each episode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct EpisodeGrid {
-    /// Number of sets of parameters. A sheet has them side by side.
+    /// Number of sets of parameters.
     pub sets: usize,
-    /// Number of episodes of each set. A sheet has them below each other.
+    /// Number of episodes of each set.
     pub episodes: usize,
 }
 
 impl EpisodeGrid {
-    /// Returns the number of pictures of an episode.
+    /// Returns the number of pictures that are shown of an episode.
     fn pictures(self) -> usize {
         (PICTURES_PER_ROW / self.sets.max(1)).max(MIN_PICTURES)
     }
 
-    /// Returns the width of an episode's pictures together, in pixels. `width` is that of a picture.
+    /// Returns the width of an episode's row of pictures, in pixels. `width` is the width of one picture.
     fn episode_width(self, width: usize) -> usize {
         self.pictures() * (width + PICTURE_GAP) - PICTURE_GAP
     }
 }
 
-/// Writes a PNG with evenly spaced frames of each episode, from the first to the last.
+/// An encoder that writes a PNG with evenly spaced frames of each episode, from the first frame to the last.
 pub(super) struct SheetEncoder {
     path: PathBuf,
     grid: EpisodeGrid,
@@ -49,14 +49,14 @@ pub(super) struct SheetEncoder {
     /// Width and height of the sheet, in pixels.
     sheet: (usize, usize),
     pixels: Vec<u8>,
-    /// Number of episodes on the sheet.
+    /// Number of finished episodes.
     done: usize,
-    /// Every `stride`-th frame of the current episode.
+    /// Frames of the current episode in memory: every `stride`-th one.
     kept: Vec<Vec<u8>>,
     stride: usize,
     /// Number of frames of the current episode so far.
     count: usize,
-    /// Last frame of the current episode.
+    /// The latest frame of the current episode.
     last: Vec<u8>,
 }
 
@@ -80,7 +80,7 @@ impl SheetEncoder {
         Ok(Self { path: path.to_owned(), grid, frame, sheet, pixels, done: 0, kept, stride: 1, count: 0, last })
     }
 
-    /// Copies a frame of the current episode to the position `index` of its row.
+    /// Copies a frame of the current episode to position `index` in the episode's row.
     fn copy_to_sheet(&mut self, frame: &[u8], index: usize) {
         let (width, height) = self.frame;
         let set = self.done / self.grid.episodes;

@@ -11,11 +11,11 @@ use crate::common::{ended, perturb, stderr};
 use crate::guarded::weights;
 use crate::patience::PPO_CART_POLE;
 
-/// Environment variable. With the value 1 the test fails if libfaketime is missing.
+/// Environment variable. If it is set, the test fails if libfaketime is missing; otherwise it is skipped.
 const REQUIRED: &str = "PERTURB_FAKETIME_REQUIRED";
-/// Library of Debian's package.
+/// Path of libfaketime in Debian's library folder.
 const LIBRARY: &str = "faketime/libfaketime.so.1";
-/// Offsets of the time of day, one after the other.
+/// Offsets of the time of day, which are set one after the other.
 const JUMPS: [&str; 5] = ["+0", "-2h", "+400d", "-30d", "+3s"];
 
 fn library() -> Option<PathBuf> {

@@ -1,4 +1,4 @@
-//! `perturb compare`, of trainings and of recorded episodes.
+//! `perturb compare` with trainings and with recorded episodes.
 
 use super::common::{perturb, stderr};
 
@@ -37,7 +37,7 @@ fn conditions_are_compared_over_seeds_and_episodes() {
     );
     assert_eq!((&it["same_episodes"], told["means"].as_array().map(Vec::len)), (&true.into(), Some(4)));
 
-    // What was recorded is not played again.
+    // Recorded episodes are not played again.
     let records = path("records.parquet");
     let evaluate = ["evaluate", "--checkpoint", &format!("{plain}/1"), "--seed", "1", "--records", &records];
     let by_length = printed(&[&evaluate[..], &episodes, &["--by", "length"]].concat());

@@ -1,4 +1,4 @@
-//! Training on servers with TLS and tokens, and over connections that change bytes.
+//! Training on servers with TLS and tokens, and over connections that corrupt bytes.
 
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
@@ -47,7 +47,7 @@ impl Guarded {
         Self::until(2040)
     }
 
-    /// Starts a server whose certificate is valid until this year.
+    /// Starts a server whose certificate is valid until `year`.
     fn until(year: i32) -> Self {
         let directory = tempfile::tempdir().expect("a directory");
         let folder = directory.path();
@@ -93,7 +93,7 @@ impl Guarded {
         }
     }
 
-    /// Trains at this address on this version.
+    /// Trains a policy on a version, with the server at `address`.
     fn train(&self, address: &str, out: &str, version: &str, has: Has) -> Output {
         let mut command = perturb(&["train", "--server", address, "--server-wait", "100", "--version", version]);
         command.args(["--env", "CartPole", "--algorithm", "a2c", "--architecture", "ff"]);

@@ -109,7 +109,7 @@ fn a_ledger_proves_training_apart_from_test_sets() {
     let (clean, words) = kept.audit("policy", &["--head", &head.replace(|digit: char| digit.is_ascii_digit(), "x")]);
     assert!(!clean && words.contains("no line has the digest"), "{words}");
 
-    // This client plays E before the training is finished.
+    // The client `tester` plays on E before the training is finished.
     kept.train("tester", "R", "leaked");
     assert!(kept.evaluate("tester", "leaked", "9").status.success());
     let (clean, words) = kept.audit("leaked", &[]);

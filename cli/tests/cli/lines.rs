@@ -11,15 +11,15 @@ use crate::common::{ended, perturb, server, stderr};
 use crate::guarded::{ALL, Guarded, weights};
 use crate::patience::PPO_CART_POLE;
 
-/// Number of connections with a fault. Later connections have none, so that the training ends.
+/// Number of connections with a fault. Later connections have none, so that the training can finish.
 const FAULTY: usize = 4;
-/// Minimum number of bytes before the first fault of a connection. A client whose first requests fail ends at once and does
-/// not wait.
+/// Minimum number of bytes before the first fault of a connection. If its first requests failed, the client would end
+/// at once instead of reconnecting.
 const BEGUN: usize = 20_000;
 /// Maximum number of bytes before a fault. A training's connection carries more bytes in both directions.
 const MOST: u64 = 200_000;
 
-/// Trains at this address.
+/// Trains a policy with the server at `address`.
 fn train(address: &str, out: &Path, guarded: Option<&Guarded>) -> (String, Vec<u8>) {
     let settings = out.with_extension("toml");
     std::fs::write(&settings, PPO_CART_POLE).expect("written");
@@ -33,7 +33,7 @@ fn train(address: &str, out: &Path, guarded: Option<&Guarded>) -> (String, Vec<u
     weights(out)
 }
 
-/// Returns the faults of a connection.
+/// Returns the faults of the connection with this number.
 fn course(dice: &mut SeededRng, number: usize) -> FaultPlan {
     let mut course = FaultPlan { delay: Duration::from_micros(dice.below(1000)), ..FaultPlan::default() };
     if number < FAULTY {

@@ -1,5 +1,5 @@
-//! Tests of the program `perturb`. They are one program, so that libtorch is linked once, and need the program
-//! `perturb-server`: run `cargo build --release` first.
+//! Tests of the program `perturb`. All of them are in one test program, so that libtorch is linked only once. They need
+//! the program `perturb-server`, so run `cargo build --release` first.
 
 mod common;
 

@@ -42,7 +42,7 @@ impl Place {
         self.0.path().join(name)
     }
 
-    /// Returns the command `perturb` or `perturb-server` with these words, in this directory.
+    /// Returns a command that runs `perturb` or `perturb-server` in this directory. The first word is the program.
     fn command(&self, words: &[&str]) -> Command {
         let perturb = Path::new(env!("CARGO_BIN_EXE_perturb"));
         let mut command = Command::new(perturb.with_file_name(words[0]));
@@ -246,7 +246,7 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
     }
     let before = place.files();
     let child = place.start(&words.split(' ').collect::<Vec<_>>());
-    // A command that has begun has a private server, which has a folder.
+    // A command has begun when its private server has made a folder.
     let has_begun = || match begun {
         "tmp" => {
             child_server(child.id()).is_some() && place.path("tmp").read_dir().is_ok_and(|mut tmp| tmp.next().is_some())
@@ -261,7 +261,7 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
     let words = stderr(&output);
     let last = words.lines().last().unwrap_or_default();
     let last = without_numbers(last);
-    // On a busy machine the server may not have started yet.
+    // On a busy machine the signal may come before the server has started.
     let is_early = begun == "tmp" && last.starts_with("perturb: stopped by signal N while ");
     assert!(last == said || is_early, "{words}");
     let left: Vec<String> = place.files().difference(&before).cloned().collect();
@@ -301,7 +301,7 @@ fn a_lost_server_is_reported_with_the_resume_command() {
     let mut server = place.command(&["perturb-server", "--listen", &address, "--log", "error"]);
     let mut server = server.stdout(Stdio::null()).spawn().expect("a server");
     wait_for_server(&place.path("socket"));
-    // --quiet, because a line of progress would come first on a slow machine.
+    // With --quiet no progress line can precede the expected message on a slow machine.
     let train = ["perturb", "-q", "train", "--env", "CartPole", "--episodes", "1000000", "--out", "my run"];
     let words = [&train[..], &["--server", &address, "--server-wait", "0"]].concat();
     let child = place.start(&words);

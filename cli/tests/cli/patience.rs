@@ -20,18 +20,18 @@ pub const PPO_CART_POLE: &str = "environment = 'CartPole'\nversion = 'R'\nalgori
 pub const A2C_PENDULUM: &str = "environment = 'Pendulum'\nversion = 'R'\nalgorithm = 'a2c'\narchitecture = 'ff'\n\
                                 episodes = 400\nnum_envs = 8\ncheckpoint_interval = 8";
 
-/// Servers that are killed.
+/// The server that is killed.
 #[derive(Clone, Copy, Debug)]
 enum Victim {
-    /// The only server, a private one.
+    /// The private server, which the program restarts itself.
     Private,
-    /// The only server, which the command line names. It is restarted.
+    /// The only server of --server. The test restarts it.
     Named,
-    /// One of two servers, which is restarted.
+    /// A server of two in --server. The test restarts it.
     OneOfTwo,
 }
 
-/// A server at a socket, which can be killed and restarted.
+/// A server on a Unix socket. It can be killed and restarted.
 pub struct Named {
     socket: PathBuf,
     child: Child,
@@ -58,7 +58,7 @@ impl Named {
         format!("unix:{}", self.socket.display())
     }
 
-    /// Process of the server.
+    /// Returns the id of the server's process.
     pub fn id(&self) -> u32 {
         self.child.id()
     }
@@ -119,7 +119,7 @@ fn harassed(text: &str, victim: Victim, most: usize, dice: &mut SeededRng) -> (u
         Victim::Private => train(&folder, text, &["--workers", "1"]),
         Victim::Named | Victim::OneOfTwo => train(&folder, text, &["--server", &list]),
     };
-    // Earlier nothing has begun yet, and a server that does not answer counts as a wrong address.
+    // Before the training begins, a server that does not answer counts as a wrong address.
     wait_for("a training", || out.join("progress.csv").exists());
     let mut kills = 0;
     while kills < most {
@@ -161,7 +161,7 @@ fn a_training_gives_same_weights_after_servers_restart(#[case] text: &str, #[cas
     assert_eq!(got, undisturbed(text), "after {kills} kills");
 }
 
-/// Starts a server at a free port.
+/// A server at a free TCP port.
 struct AtPort {
     child: Child,
     address: String,
@@ -194,7 +194,7 @@ fn a_training_over_breaking_lines_needs_no_checkpoint(#[case] text: &str, #[case
     let mut dice = SeededRng::new();
     let folder = tempfile::tempdir().expect("a directory");
     let server = AtPort::new();
-    // The first connections have no fault, because they list the server's environments.
+    // The first connections have no fault, because the client reads the server's catalogue over them.
     let course = move |number: usize| {
         let at = if number == 0 { 300_000 } else { dice.below(100_000) as usize };
         FaultPlan { from_server: Some(ByteFault { at, kind: FaultKind::Close }), ..FaultPlan::default() }
@@ -212,7 +212,7 @@ fn a_training_over_breaking_lines_needs_no_checkpoint(#[case] text: &str, #[case
     assert_eq!(result(&out), undisturbed(text), "after {} cuts", line.faults());
 }
 
-/// Runs for some minutes: `make kill-test`.
+/// The test takes some minutes, so only `make kill-test` runs it.
 #[test]
 #[ignore = "takes minutes"]
 fn a_hundred_kills_change_no_weight() {
@@ -283,7 +283,7 @@ fn a_test_outlives_its_server() {
         victim = child_server(child.id());
         victim.is_some()
     });
-    // The client must be connected and in the middle of its work, however fast the machine is.
+    // After a third of the measured time, the client is connected and in the middle of its work on any machine.
     std::thread::sleep(time / 3);
     kill("-KILL", victim.expect("a server"));
     let broken = ended(child);

@@ -1,4 +1,4 @@
-//! A killed learner leaves nothing of its private server.
+//! The private server of a killed learner ends and leaves no files.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -29,7 +29,7 @@ impl Place {
         command
     }
 
-    /// Returns the number of servers' folders.
+    /// Returns the number of folders that private servers have made.
     fn folders(&self) -> usize {
         self.path("tmp").read_dir().expect("a list").count()
     }
@@ -49,7 +49,8 @@ fn a_killed_learner_ends_its_server_and_its_folder() {
     Checkpoint::load(&place.path("run")).expect("a whole checkpoint");
 }
 
-/// When the server looks at its input, no process holds the other end any more.
+/// The server starts reading its standard input only after the learner, which holds the other end of the pipe, was
+/// killed.
 #[test]
 fn a_server_ends_when_its_learner_is_killed_at_the_start() {
     let place = Place::new();

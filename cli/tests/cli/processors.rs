@@ -1,5 +1,5 @@
-//! The same seed gives the same weights on every x86-64 processor: server and learner under qemu's models of old ones,
-//! without AVX (Nehalem) and with AVX2 and FMA (Haswell), and on the one at hand.
+//! Trainings with the same seed give the same weights on every x86-64 processor. Server and learner run on this
+//! machine's processor, and on qemu's models of older processors: Nehalem without AVX, and Haswell with AVX2 and FMA.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
@@ -8,11 +8,12 @@ use rstest::rstest;
 
 use crate::common::{stderr, wait_for_server};
 
-/// Environment variable. With the value 1 the test fails if qemu is missing.
+/// Environment variable. If it is set, the test fails if qemu is missing; otherwise it is skipped.
 const REQUIRED: &str = "PERTURB_QEMU_REQUIRED";
 const QEMU: &str = "qemu-x86_64";
 
-/// Returns the command of `program` on one of qemu's processors, or on this machine's.
+/// Returns a command that runs `program` on a processor model of qemu, or on this machine's processor if `processor` is
+/// `None`.
 fn on(processor: Option<&str>, program: &Path) -> Command {
     let Some(processor) = processor else { return Command::new(program) };
     let mut command = Command::new(QEMU);

@@ -1,4 +1,4 @@
-//! Progress output of long commands, and help for users.
+//! Progress output of long commands, help texts, and other output for users.
 
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
@@ -38,7 +38,7 @@ fn on_a_terminal(folder: &Path, command: &str) -> String {
     String::from_utf8(output.stdout).expect("text")
 }
 
-/// Returns the drawn rows of 80 columns without cursor movements.
+/// Returns everything that was drawn on a terminal as rows of 80 columns, without control sequences.
 fn lines(drawn: &str) -> Vec<String> {
     let mut text = String::new();
     let mut rest = drawn.chars();

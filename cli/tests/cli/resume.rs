@@ -19,8 +19,9 @@ use insta::assert_snapshot;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Every algorithm with every architecture, discrete and continuous actions, and MuJoCo. Rollouts end within episodes,
-/// checkpoints are frequent and between two lines of progress.csv, and no number divides the next one.
+/// Settings of trainings with every algorithm and architecture, discrete and continuous actions, and MuJoCo. Rollouts
+/// end within episodes, checkpoints are frequent and fall between two lines of progress.csv, and no interval is a
+/// multiple of another.
 const RUNS: [&str; 9] = [
     "environment = 'CartPole'\nversion = 'E'\nalgorithm = 'a2c'\nepisodes = 90\nnum_envs = 5\nn_steps = 5\nlog_interval = 3\n\
      checkpoint_interval = 7",
@@ -43,7 +44,7 @@ const RUNS: [&str; 9] = [
      checkpoint_interval = 3",
 ];
 
-/// Copies a directory, as kill -9 would leave it now.
+/// Copies a directory in its present state, which is the state after a kill -9.
 fn copy(from: &Path, to: &Path) {
     fs::create_dir_all(to).expect("a directory");
     for entry in fs::read_dir(from).expect("a list") {
@@ -69,7 +70,7 @@ fn names(directory: &Path) -> Vec<String> {
     names
 }
 
-/// Returns the values of a log from its header on, without times.
+/// Returns the rows of a log with its header, without the columns of times.
 fn cells(run: &Path, name: &str) -> Vec<Vec<String>> {
     let text = read(run, name);
     let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(|line| line.split(','));
@@ -93,7 +94,7 @@ fn events(run: &Path) -> PathBuf {
     run.join(name)
 }
 
-/// Checks that two runs have the same bytes.
+/// Checks that two runs have the same weights, checkpoints and logs, byte for byte.
 #[track_caller]
 fn assert_same(got: &Path, expected: &Path) {
     assert_eq!(Checkpoint::load(got).expect("a checkpoint"), Checkpoint::load(expected).expect("a checkpoint"));
@@ -127,7 +128,7 @@ fn servers_of(number: usize) -> (Vec<perturb_learner::client::PrivateServer>, Se
     (local, servers)
 }
 
-/// Returns an unfinished run, as a kill would leave it.
+/// Returns an unfinished run in the state after a kill.
 fn broken_off() -> TempDir {
     let (_server, servers) = servers_of(1);
     let out = tempfile::tempdir().expect("a directory");
@@ -217,7 +218,7 @@ fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
         let error = go_on(&one, &kills.path().join("1")).expect_err("there was no checkpoint yet");
         assert!(error.contains("ended before its first checkpoint, so there is nothing to resume"), "{error}");
         assert!(error.contains("--overwrite"), "{error}");
-        // The second copy, the last one, and some between.
+        // The second copy, the last copy, and two in between.
         for iteration in [2, iterations / 3, iterations / 2 + 1, iterations] {
             let killed = kills.path().join(iteration.to_string());
             let servers = if iteration.is_multiple_of(2) { &one } else { &two };
@@ -254,7 +255,7 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
     assert_eq!(resumed.checkpoint, Checkpoint::load(whole.path()).expect("a checkpoint"));
 }
 
-/// Format 1 was written by perturb 0.1.0, in whose CartPole, revision 0, the fixture was trained.
+/// The fixture is a checkpoint of format 1 that perturb 0.1.0 wrote. It was trained in CartPole of revision 0.
 #[test]
 fn old_formats_load_and_other_revisions_are_refused() {
     let (_server, servers) = servers_of(1);
@@ -275,7 +276,7 @@ fn old_formats_load_and_other_revisions_are_refused() {
     let advice = "resume with the version of perturb-server that it began with, or train again";
     assert_eq!(error, format!("the run was {revisions}; {advice}"));
 
-    // A checkpoint of today's revision could be tested.
+    // With the present revision the checkpoint could be tested.
     edit(out.path(), "/environment_spec/revision", 1.into());
     let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
     let tester = Tester::new(&servers, &checkpoint, options).expect("the environment is the same");
@@ -314,7 +315,7 @@ fn a_learner_killed_repeatedly_gives_the_same_bytes() {
 
         let child = perturb(&["train", "--config", settings, "--out", path_text]).spawn().expect("perturb");
         kill_after(child, &path, budget / 6, Duration::ZERO);
-        // A kill between the files of a checkpoint would leave this.
+        // A kill while a checkpoint is written can leave such files.
         for stray in
             [".tmp-checkpoint.json", "resume-00999999-0badf00d.safetensors", "weights-00999999-0badf00d.safetensors"]
         {
@@ -372,7 +373,7 @@ fn numbers_that_are_not_finite_leave_the_last_checkpoint() {
     assert_eq!(saved.state.counters.iterations, 1, "the one that was there before");
 }
 
-/// Removes the checksum, as in files of earlier versions.
+/// Changes a value in the checkpoint's document. Removes the checksum, which files of earlier versions do not have.
 fn edit(run: &Path, pointer: &str, value: Value) {
     let path = run.join("checkpoint/checkpoint.json");
     let mut document: Value = serde_json::from_slice(&bytes(&path)).expect("JSON");
@@ -382,7 +383,7 @@ fn edit(run: &Path, pointer: &str, value: Value) {
     fs::write(path, document.to_string()).expect("a file");
 }
 
-/// Returns the file of the checkpoint whose name begins with `start`.
+/// Returns the file of the checkpoint whose name begins with `prefix`.
 fn file(run: &Path, prefix: &str) -> PathBuf {
     let folder = run.join("checkpoint");
     folder.join(names(&folder).into_iter().find(|name| name.starts_with(prefix)).expect("a file"))
@@ -395,10 +396,10 @@ fn flip_a_bit(path: &Path) {
     fs::write(path, content).expect("a file");
 }
 
-/// Damage after which a run cannot be resumed.
-/// Name of the damage, and the function that causes it.
+/// The name of a damage, and the function that causes it.
 type Damage = (&'static str, fn(&Path));
 
+/// Damages after which a run cannot be resumed.
 const DAMAGES: &[Damage] = &[
     ("another revision of the environment", |run| edit(run, "/environment_spec/revision", 77.into())),
     ("another model", |run| edit(run, "/environment_spec/model_hash", "abc".into())),
@@ -449,10 +450,10 @@ fn a_run_that_cannot_be_resumed_says_why_and_is_not_changed() {
         let mut error = go_on(&servers, out.path()).expect_err(damage);
         error = error.replace(&out.path().display().to_string(), "RUN");
         for name in names(&base.path().join("checkpoint")) {
-            // The names have numbers of the training and a checksum.
+            // File names contain numbers of the training and a checksum, so the snapshot has only their beginnings.
             error = error.replace(&name, name.split_once('-').map_or(&name, |(kind, _)| kind));
         }
-        // The log's length depends on the times in it.
+        // The length of the log depends on the times in it, so it is replaced, too.
         let length = error.find("but had ").map(|start| start + "but had ".len());
         let digits = |start: usize| error[start..].chars().take_while(char::is_ascii_digit).count();
         if let Some((start, digits)) = length.map(|start| (start, digits(start))) {

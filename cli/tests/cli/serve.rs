@@ -1,4 +1,4 @@
-//! `perturb serve`: its address and its end. Its package tests the contents of the pages.
+//! `perturb serve`: its printed address and how it ends. The package perturb-serve tests the contents of pages.
 
 use std::io::{BufRead, BufReader, ErrorKind, Read, Write};
 use std::net::TcpStream;
@@ -30,7 +30,7 @@ fn ctrl_c_ends_it_at_once_with_an_open_page() {
     let said = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(130), "{said}");
     assert!(said.ends_with("stopped by signal 2\n"), "{said}");
-    // Bytes that were sent before the end are read first. A timeout is not the end of the connection.
+    // Bytes that were sent before the end are read first. A read timeout does not count as the end of the connection.
     match lines.find(Result::is_err) {
         None => {}
         Some(line) => {

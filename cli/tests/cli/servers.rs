@@ -1,4 +1,4 @@
-//! Runs over several servers.
+//! Experiments over several servers.
 
 use std::collections::BTreeMap;
 use std::net::TcpListener;
@@ -49,7 +49,7 @@ impl Runs {
         command.arg(self.directory.path().join("plan.toml")).arg("--out").arg(self.out(name)).spawn().expect("started")
     }
 
-    /// Returns a file of every cell by the cell's id; `None` if it is missing.
+    /// Returns the content of a file of every cell, by the cell's id; `None` if the file is missing.
     fn files(&self, name: &str, file: &str) -> BTreeMap<String, Option<String>> {
         let folder = Folder::new(&self.out(name));
         let read = |id: &str| std::fs::read_to_string(folder.cell(id).path().join(file)).ok();
@@ -86,12 +86,13 @@ fn silent() -> (TcpListener, Address) {
     (listener, address)
 }
 
-/// Starts a server that drains, but cannot end because of an open session.
+/// Starts a server and a session, begins the server's shutdown, and calls `with_session`. The open session keeps the
+/// server from ending.
 fn shutting_down(with_session: impl FnOnce(&Address)) {
     let directory = tempfile::tempdir().expect("a directory");
     let socket = directory.path().join("socket");
     let address: Address = format!("unix:{}", socket.display()).parse().expect("an address");
-    // A private server would end too soon.
+    // The server is not a private one, because that would end too soon.
     let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
     let mut server = std::process::Command::new(program)
         .args(["--listen", &address.to_string(), "--log", "error", "--grace-seconds", "120"])
@@ -119,7 +120,7 @@ fn a_run_uses_all_servers_and_survives_a_lost_one() {
     assert!(whole.values().all(Option::is_some));
 
     let run = runs.start("broken", &both);
-    // Cells 0 and 1 begin first, cell 0 on the first server.
+    // Cells 0 and 1 begin first. Cell 0 runs on the first server.
     wait_for("a training on each server", || {
         let trainings = runs.files("broken", "training/progress.csv");
         runs.plan.cells[..2].iter().all(|cell| trainings[&cell.id].is_some())
@@ -184,7 +185,7 @@ fn a_name_is_one_server_however_many_addresses_it_has() {
         .spawn()
         .expect("perturb-server");
     wait_for("the server", || std::fs::read(directory.path().join("out")).is_ok_and(|text| !text.is_empty()));
-    // If localhost is also ::1, no server listens there.
+    // localhost may also mean ::1, where no server listens.
     let name: Address = format!("localhost:{port}").parse().expect("an address");
     for turn in 0..3 {
         let one =

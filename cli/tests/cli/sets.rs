@@ -230,7 +230,8 @@ fn disturbed_episodes_are_recorded_and_replayed() {
     assert!(stderr(&refused).contains(expected), "{}", stderr(&refused));
 }
 
-/// The text's rule counts Pendulum's last steps near upright, the code's the longest time.
+/// In Pendulum, the rule of the paper's text counts the last steps near upright. The rule of its code counts the
+/// longest time near upright.
 #[test]
 fn rules_with_different_quantities_test_equal_episodes() {
     let directory = tempfile::tempdir().expect("a directory");
@@ -275,7 +276,7 @@ fn unknown_parameters_are_refused_at_the_start() {
     }
 }
 
-/// CartPole with a fault: setting the mass has no effect.
+/// A faulty CartPole, in which setting the mass has no effect.
 struct Stuck(Box<dyn Environment>);
 
 impl Stuck {
@@ -330,7 +331,7 @@ impl Environment for Stuck {
     }
 }
 
-/// Starts a server in a thread of this process, with a catalogue for tests.
+/// A server in a thread of this process, with a catalogue for tests.
 struct InThread {
     address: String,
     shutdown: Option<oneshot::Sender<()>>,

@@ -1,4 +1,4 @@
-//! Shipped examples show that policies fail in other physics, and that training on random physics repairs this.
+//! The shipped examples show that policies fail on other physics, and that training on random physics repairs this.
 
 use std::path::Path;
 
@@ -13,9 +13,10 @@ use crate::common::{addresses, run, server};
 const SEEDS: [u64; 5] = [1, 2, 3, 4, 5];
 const TEST_EPISODES: u64 = 100;
 
-/// Returns the median over seeds of the success on each version in percent, in the order D, R, E.
+/// Trains PPO on `version` with several seeds. Returns the median over seeds of the success rates on D, R and E, in
+/// percent.
 ///
-/// PPO as in experiments/quick.toml, which `perturb demo --env CartPole` repeats, is trained on `version`.
+/// The settings are those of experiments/quick.toml and `perturb demo --env CartPole`.
 fn median_success(servers: &Servers, plan: &Plan, version: Version) -> [f64; 3] {
     let is_wanted = |method: &str| method.starts_with("ppo");
     let mut configs = plan.cells.iter().map(|cell| &cell.config);
@@ -36,8 +37,8 @@ fn median_success(servers: &Servers, plan: &Plan, version: Version) -> [f64; 3] 
     })
 }
 
-/// Expected are differences of half of those that were measured with these seeds: a drop by 35 points from D to R and by
-/// 56 from D to E, a gain by 35 on R and by 56 on E.
+/// The test requires half of the differences that were measured with these seeds. Success dropped by 35 points from D
+/// to R, and by 56 points from D to E. Training on R raised it by 35 points on R, and by 56 points on E.
 #[test]
 fn physics_breaks_cart_pole_and_training_on_r_repairs_it() {
     let plan = Path::new(env!("CARGO_MANIFEST_DIR")).join("../experiments/quick.toml");

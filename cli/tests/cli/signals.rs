@@ -1,4 +1,4 @@
-//! Signals end a training soon, whatever it waits for, and all of them save a checkpoint.
+//! Signals end a training soon, even while it waits for something. The training saves a checkpoint.
 
 use std::net::TcpListener;
 use std::os::unix::process::CommandExt;
@@ -13,14 +13,15 @@ use tempfile::TempDir;
 use crate::common::{child_server, ended, kill, perturb, stderr, wait_for};
 use crate::patience::{Named, train};
 
-/// Upper bound of the time from the signal to the end, for busy machines. Without the stop flag it is a minute or more.
+/// Maximum time from the signal to the end of the program, in seconds, on a busy machine. If the signal were not
+/// handled, it would be a minute or more.
 const MAX_SECONDS: f64 = 20.0;
 const SETTINGS: &str =
     "environment = 'CartPole'\nalgorithm = 'ppo'\narchitecture = 'ff'\nepisodes = 1000000\nseed = 1\n";
-/// Updates that take minutes, after rollouts that take a moment.
+/// Settings with short rollouts and updates that take minutes.
 const LONG_UPDATES: &str = "n_epochs = 1000\nn_steps = 2048\n";
 
-/// Sends SIGTERM and waits for the end, which must come soon.
+/// Sends SIGTERM, waits for the end of the program, and checks that it came within [`MAX_SECONDS`].
 #[track_caller]
 fn terminated(child: Child) -> Output {
     let start = Instant::now();
@@ -95,7 +96,8 @@ fn a_long_update_is_broken_off() {
     assert!(said.contains("stopped by signal 15 during an update"), "{said}");
 }
 
-/// Trains until a signal comes. Returns the end, and the iterations in the checkpoint and in the log.
+/// Starts a training, waits for its first progress, and sends it a signal. Returns the process and the training's
+/// folder.
 fn signalled(signal: &str, prepare: impl FnOnce(&mut Command)) -> (Child, TempDir) {
     let folder = tempfile::tempdir().expect("a directory");
     let mut command = perturb(&["train", "--env", "CartPole", "--algorithm", "a2c", "--seed", "1"]);
@@ -115,7 +117,7 @@ fn signalled(signal: &str, prepare: impl FnOnce(&mut Command)) -> (Child, TempDi
 #[case::terminate("-TERM", 15)]
 fn every_warning_saves_a_checkpoint(#[case] signal: &str, #[case] number: i32) {
     let (child, folder) = signalled(signal, |command| {
-        // The tests themselves may run where hangups are ignored, which programs inherit.
+        // The tests may run in a shell that ignores SIGHUP, and programs inherit that. This program does not ignore it.
         let program = command.get_program().to_owned();
         let arguments: Vec<_> = command.get_args().map(ToOwned::to_owned).collect();
         *command = Command::new("env");
@@ -136,7 +138,7 @@ fn every_warning_saves_a_checkpoint(#[case] signal: &str, #[case] number: i32) {
 #[test]
 fn a_hangup_that_nohup_ignores_ends_nothing() {
     let (mut child, _folder) = signalled("-HUP", |command| {
-        // The shell passes on that it ignores the signal.
+        // The program inherits from this shell that the signal is ignored.
         let program = command.get_program().to_owned();
         let arguments: Vec<_> = command.get_args().map(ToOwned::to_owned).collect();
         *command = Command::new("sh");

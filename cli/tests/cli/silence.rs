@@ -1,4 +1,4 @@
-//! Servers that stop during a training, are silent for a while, and continue.
+//! Servers that are stopped during a training, and continue after a while.
 
 use rstest::rstest;
 
@@ -6,7 +6,7 @@ use crate::common::{ended, kill, wait_for};
 use crate::patience::{A2C_PENDULUM, Named, PPO_CART_POLE, result, train, undisturbed};
 use perturb_faults::{FaultPlan, FaultyProxy, SeededRng};
 
-/// Stops every thread of a server. It may answer until the last thread has stopped.
+/// Stops a server, and waits until all its threads are stopped. Before that it may still answer.
 fn freeze(server: &Named) {
     kill("-STOP", server.id());
     let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
@@ -48,7 +48,7 @@ fn a_briefly_silent_server_is_waited_for(#[case] text: &str, #[case] names: &[&s
     assert_eq!(result(&out), undisturbed(text), "after {stops} stops");
 }
 
-/// Uses TCP, because sessions have leases there.
+/// The server listens on TCP, because only there do sessions have leases.
 #[test]
 fn a_session_resumes_when_a_silent_server_answers_again() {
     let folder = tempfile::tempdir().expect("a directory");

@@ -49,14 +49,14 @@ impl Place {
         self.path(name).display().to_string()
     }
 
-    /// Changes a number of the arm's model.
+    /// Changes a number in the model of the task `arm`.
     fn change_the_arm(&self) {
         let path = self.path("arm/arm.xml");
         let text = fs::read_to_string(&path).expect("a model");
         fs::write(path, text.replacen("damping=\"0.2\"", "damping=\"0.3\"", 1)).expect("written");
     }
 
-    /// Runs `perturb` here.
+    /// Runs `perturb` in this folder.
     fn run(&self, words: &[&str]) -> Output {
         perturb(words).current_dir(self.0.path()).output().expect("perturb runs")
     }
@@ -68,7 +68,7 @@ impl Place {
         String::from_utf8(output.stdout).expect("text")
     }
 
-    /// Returns the messages of a command that is refused as wrong from the beginning.
+    /// Returns the messages of a command that ends with status 2 before it begins.
     #[track_caller]
     fn refused(&self, words: &[&str]) -> String {
         let output = self.run(words);
@@ -174,7 +174,7 @@ fn an_experiment_over_two_task_folders_is_reported_and_audited() {
     let place = Place::new();
     let out = place.text("out");
     place.printed(&["plan", "plan.toml", "--measure", "0"]);
-    // From another directory: the folders are found beside the plan.
+    // The command runs in another directory. Task folders in a plan are relative to the plan's file.
     let run = |words: &[&str]| {
         let plan = place.text("plan.toml");
         perturb(&[&["run", &plan, "--out", &out], words].concat()).output().expect("perturb runs")
@@ -219,7 +219,7 @@ fn results_of_different_models_are_not_reported_together() {
     let text = fs::read_to_string(&path).expect("a result");
     let mut result: serde_json::Value = serde_json::from_str(&text).expect("JSON");
     result["training"]["model_hash"] = "another".into();
-    // Documents without a checksum are read as they are.
+    // Without its checksum, a changed document is accepted.
     result.as_object_mut().expect("an object").remove("crc32c");
     fs::write(&path, result.to_string()).expect("written");
     let output = place.run(&["report", "out"]);

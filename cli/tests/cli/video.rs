@@ -104,7 +104,7 @@ fn a_gif_has_a_frame_for_each_start_and_each_step() {
             frames.iter().map(|frame| frame[bytes.clone()].to_vec()).collect::<HashSet<_>>().len()
         };
         let distinct = pixels(&frames, 0..240) as u64;
-        // A pendulum at rest may look the same in two frames.
+        // Some frames may be equal, because a pendulum at rest looks the same.
         assert!(distinct * 10 >= frames.len() as u64 * 9, "{distinct} of {} pictures differ", frames.len());
         assert_eq!(pixels(&frames, 240..usize::from(size.1)), frames.len(), "the text below differs in every frame");
 
@@ -152,7 +152,7 @@ fn large_gifs_show_fewer_frames_in_the_same_time() {
     assert_eq!(delays.iter().filter(|&&delay| delay >= 200).count(), 20, "the end of each episode");
 }
 
-/// Plays with the library and deletes the file.
+/// Makes a film with the library, deletes the file, and returns the film's figures.
 fn filmed(servers: &Servers, checkpoint: &Checkpoint, version: Version, episodes: u64) -> Footage {
     filmed_every(1, servers, checkpoint, version, episodes)
 }
@@ -237,7 +237,7 @@ fn a_contact_sheet_has_the_versions_side_by_side() {
     let set = 3 * 240 + 2 * 2;
     let across = 2 * set + 8;
     assert!(both.iter().all(|row| row.len() == 3 * across));
-    // Each half equals the sheet of its version, with the same episodes in the same rows.
+    // Each half of the sheet equals the sheet of one version, with the same episodes in the same rows.
     for (version, start) in [("D", 0), ("E", set + 8)] {
         let (_, alone) = sheet("b.png", version);
         assert_eq!(alone.len(), both.len());
@@ -382,7 +382,8 @@ fn processor_seconds(id: u32) -> f64 {
     ticks.sum::<f64>() / 100.0
 }
 
-/// Begins a long video, calls `end` when a part of it is made, and returns the output of `perturb`.
+/// Starts a long video, calls `end` when a part of the video is done, and returns the output of `perturb` and the
+/// remaining files.
 fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Output, Vec<PathBuf>) {
     let training = crate::common::server(1);
     let (out, _) = trained(&training, PENDULUM);
@@ -393,7 +394,8 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
         command.args(["--server", address]);
     }
     let child = command.spawn().expect("perturb");
-    // A GIF is written at the end. The start alone takes a fraction of this time.
+    // A GIF is written only at its end, so processor time shows that frames are made. Starting takes less time than
+    // this.
     wait_for("the first frames", || processor_seconds(child.id()) > 0.5);
     end(child.id());
     (ended(child), names(&folder))

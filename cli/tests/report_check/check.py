@@ -1,10 +1,11 @@
-"""Opens a report in headless Chromium, without network, and compares what it shows with the report's files.
+"""Opens a report in headless Chromium, without network, and compares its content with the report's files.
 
     check.py CHROMIUM DIR PAGE SCREENSHOTS
 
-DIR is an experiment with its folder report/, PAGE its HTML page, SCREENSHOTS a folder for pictures of the whole page: by
-day at three widths, in the dark, and printed. The browser is driven over a pipe (the DevTools protocol), so that Python's own library is enough. Ends with 1 and a list of
-what is wrong.
+DIR is an experiment with its folder report/, and PAGE is its HTML page. The folder SCREENSHOTS gets pictures of the
+whole page: light at three widths, dark, and printed. The script controls the browser with the DevTools protocol over a
+pipe, so that it needs only Python's standard library. After a failure, the exit status is 1 and a list of the faults is
+printed.
 """
 
 import base64
@@ -16,13 +17,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-# CSS pixels: a desktop, a window as narrow as half of one, and a telephone.
+# Widths of the window in CSS pixels: a desktop, half a desktop, and a telephone.
 WIDTHS = (1280, 700, 400)
 HEIGHT = 1600
-# And A4 within its margins.
+# Width of A4 paper without its margins, in CSS pixels.
 PAPER = 703
 
-# What the page shows, by its own account.
+# JavaScript that counts the elements of the page and measures its layout.
 LOOK = """
 (() => {
   const seen = element => { const box = element.getBoundingClientRect(); return box.width > 0 && box.height > 0; };
@@ -46,12 +47,12 @@ LOOK = """
     links: document.querySelectorAll('nav a').length,
     overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
     height: document.documentElement.scrollHeight,
-    // Pictures that a line across the page meets, at most.
+    // Maximum number of pictures side by side.
     abreast: (() => {
       const boxes = [...document.querySelectorAll('main svg')].map(svg => svg.getBoundingClientRect());
       return Math.max(...boxes.map(a => boxes.filter(b => b.top < a.top + 1 && a.top + 1 < b.bottom).length));
     })(),
-    // Where the contents are when the middle of the page is read.
+    // Position of the table of contents in the window when the middle of the page is in view.
     contents: (() => {
       scrollTo(0, document.documentElement.scrollHeight / 2);
       const top = document.querySelector('nav').getBoundingClientRect().top;
@@ -62,7 +63,7 @@ LOOK = """
 })()
 """
 
-# Figures whose links do not lead to what is shown and to its numbers; of what they are.
+# JavaScript for the names of figures whose links do not lead to the shown picture and to its numbers.
 FILES = """
 [...document.querySelectorAll('figure:not(.missing)')].filter(figure => {
   const content = kind => {
@@ -75,7 +76,8 @@ FILES = """
 }).map(figure => figure.querySelector('[aria-label]').getAttribute('aria-label'))
 """
 
-# Texts of pictures, by what is wrong with them: less than 9 pt in a column of 85 mm, or less contrast than WCAG asks for.
+# JavaScript that counts faulty texts: smaller than 9 pt if the picture is 85 mm wide, or with less contrast than WCAG
+# requires.
 TEXTS = """
 (() => {
   const linear = c => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;
@@ -94,14 +96,14 @@ TEXTS = """
     small: texts.filter(text => points(text) < 9).length,
     faint: texts.filter(text => contrast(getComputedStyle(text).fill) < 4.5).length
       + words.filter(word => contrast(getComputedStyle(word).color) < 4.5).length,
-    // A picture's own paper is the page's.
+    // Pictures whose background differs from the background of the page.
     sheets: [...document.querySelectorAll('main svg')].filter(svg =>
       Math.abs(luminance(getComputedStyle(svg.querySelector('[fill="#FFFFFF"]')).fill) - paper) > 0.001).length,
   };
 })()
 """
 
-# How the page is printed.
+# JavaScript that measures the printed layout.
 PRINTED = """
 (() => {
   const millimetres = pixels => pixels / 96 * 25.4;
@@ -111,9 +113,9 @@ PRINTED = """
     paper: getComputedStyle(document.body).backgroundColor,
     widths: [...new Set([...document.querySelectorAll('main svg')].map(svg =>
       Math.round(millimetres(svg.getBoundingClientRect().width))))],
-    // What is wider than the paper makes the browser print all of it smaller.
+    // If an element is wider than the paper, the browser scales the whole page down.
     overflow: document.documentElement.scrollWidth - document.documentElement.clientWidth,
-    // A page of A4 has 269 mm within its margins.
+    // The height of A4 paper without its margins is 269 mm.
     cut: figures.filter(figure => millimetres(figure.getBoundingClientRect().height) > 269
       || getComputedStyle(figure).breakInside !== 'avoid').length,
   };
@@ -122,13 +124,13 @@ PRINTED = """
 
 
 class Browser:
-    """Chromium with one page, which reaches no host but `reachable`."""
+    """Chromium with one page, which can reach only the host `reachable`."""
 
     def __init__(self, program, profile, reachable=""):
         to_browser, self.requests = os.pipe()
         self.replies, from_browser = os.pipe()
 
-        def pipes():  # the browser reads from 3 and writes to 4
+        def pipes():  # the browser reads from file descriptor 3 and writes to 4
             reading, writing = os.dup(to_browser), os.dup(from_browser)
             os.dup2(reading, 3)
             os.dup2(writing, 4)
@@ -137,7 +139,7 @@ class Browser:
         rules = f"MAP * ~NOTFOUND, EXCLUDE {reachable}" if reachable else "MAP * ~NOTFOUND"
         command += ["--no-first-run", "--disable-background-networking", f"--host-resolver-rules={rules}"]
         if os.geteuid() == 0:
-            command.append("--no-sandbox")  # which root cannot have
+            command.append("--no-sandbox")  # the sandbox does not work for root
         self.process = subprocess.Popen(
             command, preexec_fn=pipes, close_fds=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -182,7 +184,7 @@ class Browser:
         self.call("Emulation.setEmulatedMedia", media=media, features=features)
 
     def shoot(self, folder, name, width, height):
-        """Pictures of the whole page, from above to below."""
+        """Takes screenshots of the whole page, from top to bottom."""
         for number, top in enumerate(range(0, height, HEIGHT)):
             clip = {"x": 0, "y": top, "width": width, "height": min(HEIGHT, height - top), "scale": 1}
             shot = self.call("Page.captureScreenshot", clip=clip, captureBeyondViewport=True)
@@ -208,7 +210,7 @@ def lines(path):
 
 
 def expectations(directory):
-    """What the page must have, by the report's tables and the folder's pictures."""
+    """Returns the numbers of elements that the page must have, according to the files of the report."""
     report = directory / "report"
     metrics, scenarios, selected = (lines(report / f"{name}.csv") for name in ("metrics", "scenarios", "selected"))
     environments = {line["environment"] for line in scenarios}
@@ -227,10 +229,10 @@ def expectations(directory):
     pairs = (report / "comparisons.csv").exists()
     return {
         "rows": {
-            "metrics": len(shown) // 3,  # three metrics in a row
-            "scenarios": len(scenarios) // 3,  # three tests in a row
+            "metrics": len(shown) // 3,  # a row has three metrics
+            "scenarios": len(scenarios) // 3,  # a row has three tests
         },
-        # Metrics, scenarios, interquartile means and pairs.
+        # Tables of metrics, scenarios, interquartile means and pairs.
         "tables": 2 * len(environments) + several + 1 + pairs,
         "findings": len(list(report.glob("*finding.svg"))),
         "first": "finding",
@@ -285,7 +287,7 @@ def main():
         browser.resize(WIDTHS[0])
         browser.shoot(screenshots, "dark", WIDTHS[0], browser.look()["height"])
         browser.resize(PAPER)
-        browser.show(media="print", scheme="dark")  # paper is light by night, too
+        browser.show(media="print", scheme="dark")  # the printed page must be light in dark mode, too
         printed = browser.look(PRINTED)
         expected_print = {
             "contents": "none",

@@ -1,12 +1,12 @@
-"""Watches trainings and an experiment on the pages of `perturb serve`, in headless Chromium.
+"""Checks the pages of `perturb serve` in headless Chromium while a training and an experiment run.
 
     watch.py CHROMIUM PROGRAMS DIR
 
-PROGRAMS is the folder of `perturb` and `perturb-server`, DIR a folder that is made anew: runs/ in it is what is served,
-pictures/ has what the pages look like at 1280 and at 400 pixels, light and dark. A training and an experiment are under way
-meanwhile: curves, cells and the report must grow without a page being loaded again, nothing may be said on the console or
-asked of another host, and no page be wider than its window. At the end Ctrl-C ends the server with open pages. Ends with 1 and
-a list of what is wrong.
+PROGRAMS is the folder of `perturb` and `perturb-server`. DIR is deleted and made again. Its folder runs/ is served, and
+its folder pictures/ gets screenshots of the pages at widths of 1280 and 400 pixels, light and dark. The check fails if
+curves, cells or the report do not grow without a reload, if a page prints to the console or requests something from
+another host, or if a page is wider than its window. At the end, Ctrl-C must end the server although pages are open.
+After a failure, the exit status is 1 and a list of the faults is printed.
 """
 
 import base64
@@ -26,17 +26,17 @@ sys.path.append(str(Path(__file__).parents[1] / "report_check"))
 from check import Browser
 
 WIDTHS = {1280: 900, 400: 800}
-LIMIT = 300  # seconds: much longer than anything takes, as the machine may be busy
+LIMIT = 300  # upper bound of every wait, s; it is long because the machine may be busy
 WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 LIVE = "document.getElementById('live').dataset.state === 'live'"
-# How far the curve reaches, in episodes.
+# JavaScript for the last episode number of the learning curve.
 REACH = "Number(document.querySelector('[data-chart=return]').dataset.reach ?? 0)"
 DONE = "document.querySelectorAll('.map li.done').length"
 REPORTED = "document.querySelector('iframe.report').contentDocument?.body.innerText.includes('WORDS') ?? false"
-# The colours of the lines, by the names of the plots; that of cells may have any of its kinds'.
+# The possible colours of the lines in each plot. Lines of the plot `cells` have the colour of the cell's kind.
 LINES = {"return": ["#0072b2"], "success": ["#009e73"], "length": ["#cc79a7"], "speed": ["#d55e00"]}
 LINES["cells"] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"]
-# Of each plot that has a canvas: its name, and how many pixels have a colour of its lines.
+# JavaScript for a list with the name of each drawn plot, and its number of pixels in a colour of its lines.
 PAINTED = """[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
   const name = canvas.closest('figure').dataset.chart;
   const several = canvas.closest('figure').querySelector('.legend') !== null;
@@ -52,7 +52,7 @@ PAINTED = """[...document.querySelectorAll('figure.chart canvas')].map(canvas =>
   return [name, count];
 })""".replace("LINES", json.dumps(LINES))
 CURVES = list(LINES)[:4]
-# A line is at least so long, pixels.
+# Minimum number of coloured pixels by which a plot counts as having a line.
 LEAST_LINE = 100
 UNNAMED = """
 [...document.querySelectorAll('img:not([alt]), [role=img]:not([aria-label]), iframe:not([title]), progress:not([aria-label])')]
@@ -62,7 +62,7 @@ BROKEN = "[...document.images].filter(image => image.complete && image.naturalWi
 
 
 class Pages:
-    """The pages of a server in a browser, and what is wrong with them."""
+    """The pages of a server in a browser, and the faults that were found in them."""
 
     def __init__(self, browser, own, pictures):
         self.browser, self.own, self.pictures, self.wrong = browser, own, pictures, []
@@ -76,7 +76,7 @@ class Pages:
             self.wrong.append(f"{what}: {got}, expected {expected}")
 
     def until(self, what, expression):
-        """Waits until the page says so; whether it did."""
+        """Waits until the JavaScript expression is true. Returns its value, or False after the limit."""
         start = time.monotonic()
         while not (seen := self.evaluate(expression)):
             if time.monotonic() - start > LIMIT:
@@ -96,8 +96,8 @@ class Pages:
         self.check(f"{what}: the page was not loaded again", self.evaluate("window.since"), "the beginning")
 
     def draw(self, name, plots=(), schemes=("light", "dark")):
-        """Takes pictures, and looks at what must hold at any size: these plots are there, if that is
-        known, and each has its line."""
+        """Takes screenshots at all widths and colour schemes, and checks the layout of each. The page must have
+        exactly `plots` (unless it is None), and each plot must have a line."""
         for scheme in schemes:
             self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
             for width, height in WIDTHS.items():
@@ -122,7 +122,7 @@ class Pages:
         self.browser.call("Emulation.setDeviceMetricsOverride", **metrics)
 
     def complaints(self):
-        """What pages asked of others, and said on the console."""
+        """Yields a sentence for each request to another host, and for each message on the console."""
         for event in self.browser.events:
             method, said = event["method"], event["params"]
             if method == "Network.requestWillBeSent" and not said["request"]["url"].startswith((self.own, "data:", "about:")):
@@ -198,7 +198,7 @@ def main():
 
 
 def watch_training(pages):
-    """A curve that grows."""
+    """Checks the page of a training: its learning curve must grow."""
     wait_for_page(pages, "run/cart-pole-on-R")
     pages.open("run/cart-pole-on-R")
     pages.until("a curve", f"{REACH} > 0")
@@ -229,12 +229,12 @@ def watch_curves(pages):
 
 
 def watch_experiment(pages, experiment):
-    """Cells that are begun and done, and a report that has them."""
+    """Checks the page of an experiment: cells must begin and finish, and the report must contain them."""
     wait_for_page(pages, "run/study")
     pages.open("run/study")
     pages.until("a cell in work", "document.querySelectorAll('.working tbody tr').length > 0")
     pages.until("its curve", "document.querySelector('[data-chart=cells]').dataset.points > 1")
-    # From one cell to the next there may be none for a moment.
+    # Between two cells there may be no line for a moment, so the check waits for it.
     pages.until("its line", f"{PAINTED}.some(([plot, count]) => plot === 'cells' && count >= {LEAST_LINE})")
     pages.draw("experiment", None, schemes=("light",))
     pages.until("a link to its training", "document.querySelector('.map li.in-work a') !== null")
@@ -253,7 +253,7 @@ def watch_experiment(pages, experiment):
 
 
 def wait_for_page(pages, path):
-    """Waits until the run is there: the browser would say on the console that it is not."""
+    """Waits until the page exists. Otherwise the browser would print an error to the console."""
     start = time.monotonic()
     while time.monotonic() - start < LIMIT:
         try:

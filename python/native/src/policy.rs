@@ -77,7 +77,7 @@ impl Policy {
         self.checkpoint.policy.memory_size() > 0
     }
 
-    /// What the policy observes: "state" or "parameters".
+    /// The contents of the policy's observations: "state" or "parameters".
     #[getter]
     fn observe(&self) -> String {
         self.checkpoint.state.config.common.observe.to_string()

@@ -14,25 +14,25 @@ use super::{JsonArgs, OneOf, PlayArgs, SetArgs, at_least_one, natural};
 #[command(after_help = "Examples:
   perturb compare plain=runs/d1,runs/d2,runs/d3 random=runs/r1,runs/r2,runs/r3
   perturb compare runs/plain runs/random             # folders with a training for each seed
-  perturb compare saved/a saved/b --score return     # of Assessment.save, or --records of perturb evaluate
+  perturb compare saved/a saved/b --score return     # folders of Assessment.save, or --records of perturb evaluate
   perturb compare results.parquet/classic-ff --by algorithm --where environment=CartPole trained_on=R seed=2..6")]
 pub struct CompareArgs {
-    /// Conditions, each with a policy for each seed: the --out folders of trainings, which are tested now; cells of an
-    /// experiment, --records files of `perturb evaluate`, or folders that `Assessment.save` wrote in Python, whose
-    /// recorded episodes are read; or a folder that has one of these for each seed. The name is by default that of the
-    /// first folder. Policies of trainings with the same seed are pairs, the others by their order. A condition may also
-    /// be FILE.parquet or FILE.parquet/STUDY of `perturb export`: the rows that --where chooses, or with --by several
-    /// conditions.
+    /// Conditions, each with one policy for each training seed. A PATH is the --out folder of a training, which is
+    /// tested now; or recorded tests, i.e. a cell of an experiment, a --records file of `perturb evaluate`, or a folder
+    /// that `Assessment.save` wrote in Python; or a folder that contains several of these. NAME is by default the name
+    /// of the first PATH. The policies of two conditions are compared in pairs: trainings by their seeds, recorded
+    /// tests by their order. A PATH may also be FILE.parquet or FILE.parquet/STUDY of `perturb export`: the rows that
+    /// --where chooses, divided by --by into several conditions.
     #[arg(value_name = "[NAME=]PATH[,PATH]", required = true)]
     pub conditions: Vec<String>,
-    /// What is compared: success rates, returns or lengths of episodes.
+    /// Score to compare: success rates, returns, or lengths of episodes in steps.
     #[arg(long, value_name = "SCORE", default_value = "success", value_parser = OneOf::new(&["success", "return", "length"]))]
     pub score: String,
-    /// The condition that all others are compared with [default: each is compared with each before it].
+    /// The condition that all others are compared with [default: all pairs of conditions are compared].
     #[arg(long, value_name = "NAME")]
     pub baseline: Option<String>,
-    /// Versions to test trainings on, separated by commas [default: those of the recorded tests, else D,R,E; none with
-    /// --parameters or --contexts].
+    /// Versions to test trainings on, separated by commas [default: the versions of the recorded tests, or D,R,E
+    /// without recorded tests; none with --parameters or --contexts].
     #[arg(long, value_delimiter = ',')]
     pub versions: Vec<Version>,
     /// The rows of results tables that are compared: those with one of these values of a column or setting, such as
@@ -53,7 +53,7 @@ pub struct CompareArgs {
     /// Random seed of the tests, the same for all trainings.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = natural::<u64>)]
     pub seed: u64,
-    /// Write the comparison to this file as HTML, as the section of a report.
+    /// Write the comparison to this file as an HTML page with tables and figures.
     #[arg(long, value_name = "FILE")]
     pub html: Option<PathBuf>,
     #[command(flatten)]

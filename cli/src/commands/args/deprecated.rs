@@ -1,5 +1,4 @@
-//! Old spellings of commands and options. They work as before, with a line on standard error that names the new
-//! spelling.
+//! Deprecated names of commands and options. They still work, and a line on standard error states the new name.
 
 use std::ffi::{OsStr, OsString};
 use std::os::unix::ffi::{OsStrExt, OsStringExt};
@@ -7,7 +6,7 @@ use std::os::unix::ffi::{OsStrExt, OsStringExt};
 /// Old and new names of commands.
 const COMMANDS: [(&str, &str); 1] = [("rates", "rescore")];
 
-/// Old and new names of options, each with its command.
+/// The command, the old name and the new name of each renamed option.
 const OPTIONS: [(&str, &str, &str); 5] = [
     ("plan", "--missing", "--unfinished-in"),
     ("plan", "--from", "--timings-from"),
@@ -16,8 +15,8 @@ const OPTIONS: [(&str, &str, &str); 5] = [
     ("heatmap", "--base", "--base-version"),
 ];
 
-/// Replaces the old spellings in a process's arguments, of which the first is the program. `warn` gets a sentence for
-/// each.
+/// Replaces deprecated names in a process's arguments. The first argument is the program's name. Calls `warn` with a
+/// sentence for each replacement.
 pub(super) fn renamed(mut arguments: Vec<OsString>, mut warn: impl FnMut(String)) -> Vec<OsString> {
     let is_name = |argument: &OsString| !argument.as_bytes().starts_with(b"-");
     let Some(mut position) = arguments.iter().skip(1).position(is_name).map(|position| position + 1) else {
@@ -42,7 +41,7 @@ pub(super) fn renamed(mut arguments: Vec<OsString>, mut warn: impl FnMut(String)
     arguments
 }
 
-/// Returns `argument` with the name `new` if it is the option `old`, with or without `=VALUE`.
+/// If `argument` is the option `old`, with or without `=VALUE`, returns it with the name `new`.
 fn renamed_option(argument: &OsStr, old: &str, new: &str) -> Option<OsString> {
     let value = argument.as_bytes().strip_prefix(old.as_bytes())?;
     (value.is_empty() || value[0] == b'=').then(|| OsString::from_vec([new.as_bytes(), value].concat()))

@@ -10,8 +10,8 @@ use super::{JsonArgs, ServerArgs, WaitArgs, at_least_one, natural};
 
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
-  perturb plan experiments/quick.toml                # measures for some seconds what it costs
-  perturb plan experiments/paper.toml --measure 0    # prints only what it consists of
+  perturb plan experiments/quick.toml                # measures for some seconds how long it takes
+  perturb plan experiments/paper.toml --measure 0    # prints only the number of trainings and tests
   perturb plan experiments/quick.toml --unfinished-in runs/quick")]
 pub struct PlanArgs {
     /// An experiment file, e.g. experiments/paper.toml.
@@ -28,8 +28,8 @@ pub struct PlanArgs {
     /// Seconds of measurement for each group of trainings; 0 measures nothing.
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = natural::<u64>)]
     pub measure: u64,
-    /// Estimate from the durations of the finished cells in this folder, e.g. of a random tenth. They apply to cells of
-    /// the same environment and method; the others are measured.
+    /// Estimate from the durations of the finished cells in this folder, e.g. of a random tenth. They apply to cells
+    /// with the same environment and method. All other cells are measured.
     #[arg(long, value_name = "DIR")]
     pub timings_from: Option<PathBuf>,
     /// Value of --jobs for the planned run [default: one for each core].
@@ -52,16 +52,16 @@ pub struct RunArgs {
     /// Directory of the results. Cells that are finished there are not run again.
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// Number of processes at the same time; each runs a group of cells [default: one for each core; with --engine, one
-    /// in each job].
+    /// Number of simultaneous processes. Each runs a group of cells [default: one for each core; with --engine, one in
+    /// each job].
     #[arg(long, value_name = "N", value_parser = at_least_one::<usize>)]
     pub jobs: Option<usize>,
-    /// Maximum number of cells that a process runs together; they have the same environment and architecture. 1 runs
-    /// each cell by itself. The number changes no result.
+    /// Maximum number of cells of a group. A process runs them together, and they have the same environment and
+    /// architecture. 1 runs each cell by itself. Results do not depend on this number.
     #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one::<usize>)]
     pub group: usize,
-    /// Skip the cells that are done in this table of `perturb export`, with the same settings and tests. Their results
-    /// also count when configurations are selected.
+    /// Skip the cells that this table of `perturb export` has with the same settings and tests. The selection of
+    /// configurations uses their results.
     #[arg(long, value_name = "FILE")]
     pub done: Option<PathBuf>,
     /// Run failed cells again.
@@ -98,13 +98,13 @@ pub struct EngineArgs {
     /// Partition of Slurm [default: Slurm's default].
     #[arg(long, value_name = "NAME", requires = "engine")]
     pub partition: Option<String>,
-    /// Time limit of a job: minutes, or another of Slurm's formats, e.g. 1-12:00:00 [default: the partition's limit].
+    /// Time limit of a job in minutes, or in another format of Slurm, e.g. 1-12:00:00 [default: the partition's limit].
     #[arg(long, value_name = "TIME", requires = "engine")]
     pub time: Option<TimeLimit>,
     /// Maximum number of jobs that run at the same time [default: no limit].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<u32>)]
     pub array_limit: Option<u32>,
-    /// Number of cells in a job; they have the same environment and architecture [default: as many as take some
+    /// Number of cells in a job. They have the same environment and architecture [default: the number that takes some
     /// minutes].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<usize>)]
     pub cells_per_job: Option<usize>,
@@ -148,12 +148,13 @@ pub struct ExportArgs {
   perturb report runs/quick assessed/mine --out report
   perturb report results/results.parquet/classic-ff --out classic-ff")]
 pub struct ReportArgs {
-    /// The --out folder of `perturb run`, a study of a results table (FILE.parquet/STUDY), or folders that `Assessment.save`
-    /// wrote in Python. One experiment or study and any number of assessments can be given together; tables and pictures
-    /// then show all agents.
+    /// The --out folder of `perturb run`, a study of a results table (FILE.parquet/STUDY), or folders that
+    /// `Assessment.save` wrote in Python. One experiment or study and any number of assessments can be given together;
+    /// tables and pictures then show all agents.
     #[arg(required = true, value_name = "DIR")]
     pub dirs: Vec<PathBuf>,
-    /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments and tables].
+    /// Folder for tables and pictures [default: report/ in the experiment's folder; required with assessments and
+    /// tables].
     #[arg(long, value_name = "DIR")]
     pub out: Option<PathBuf>,
     /// Rule that selects configurations [default: the plan's rule]. For a plan with selection = "clean", `paper`

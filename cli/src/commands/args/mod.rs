@@ -41,8 +41,8 @@ pub struct Cli {
     /// Print only warnings and errors on standard error.
     #[arg(short, long, global = true, display_order = 1000, conflicts_with = "verbose")]
     pub quiet: bool,
-    /// Log to standard error; give it twice for all details. RUST_LOG sets a filter, e.g. warn,h2=debug, also for
-    /// dependencies.
+    /// Log to standard error. Give it twice for all details. RUST_LOG sets a filter, e.g. warn,h2=debug, which can also
+    /// select dependencies.
     #[arg(short, long, global = true, display_order = 1001, action = ArgAction::Count)]
     pub verbose: u8,
     #[command(subcommand)]
@@ -50,16 +50,16 @@ pub struct Cli {
 }
 
 impl Cli {
-    /// Parses the process's arguments. Ends the process with status 2 if they are wrong. `warn` gets a sentence for
-    /// each old spelling.
+    /// Parses the process's arguments. Ends the process with status 2 if they are wrong. Calls `warn` with a sentence
+    /// for each deprecated name.
     pub fn from_process(warn: impl FnMut(String)) -> Self {
         let arguments = deprecated::renamed(std::env::args_os().collect(), warn);
         let matches = Self::parser().get_matches_from(arguments);
         Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
     }
 
-    /// Returns the parser. A negative number counts as the value of the option before it, so that the option's own
-    /// error is shown.
+    /// Returns the parser. It takes a negative number as the value of the option before it, so that the option's own
+    /// error message is shown.
     pub fn parser() -> clap::Command {
         let with_negative = |arg: Arg| match arg.get_action().takes_values() {
             true => arg.allow_negative_numbers(true),
@@ -81,21 +81,21 @@ pub enum CliCommand {
     Train(Box<TrainArgs>),
     /// Test a trained policy.
     Evaluate(EvaluateArgs),
-    /// Compare conditions, such as ways of training, over their seeds and in the same test episodes.
+    /// Compare conditions, such as training methods, over several seeds and in the same test episodes.
     Compare(CompareArgs),
-    /// Train on default and on random physics, and compare both policies where they were not trained.
+    /// Train on default and on random physics, and compare both policies on physics that they were not trained on.
     Demo(DemoArgs),
-    /// Print what an experiment file consists of, and what it costs.
+    /// Print the number of trainings and tests of an experiment file, and estimate how long they take.
     Plan(PlanArgs),
     /// Run all trainings and tests of an experiment file, or resume them.
     Run(RunArgs),
     /// Add the results of experiments to one table, a Parquet file.
     Export(ExportArgs),
-    /// Make tables of an experiment's results, with the paper's for comparison.
+    /// Make tables of an experiment's results, with the paper's results for comparison.
     Report(ReportArgs),
     /// Draw the training curves of an experiment.
     Curves(CurvesArgs),
-    /// Draw the success of policies over two parameters: of given policies, or of those that an experiment selected.
+    /// Draw the success of policies over two parameters, for given policies or for those that an experiment selected.
     Heatmap(HeatmapArgs),
     /// Film a trained policy.
     Video(VideoArgs),
@@ -103,13 +103,13 @@ pub enum CliCommand {
     Audit(AuditArgs),
     /// Compute success rates of recorded test episodes at any threshold, without replaying them.
     Rescore(RescoreArgs),
-    /// Print a script by which a shell completes commands and options.
+    /// Print a shell script that completes commands and options.
     Completions(CompletionsArgs),
     /// Write perturb's manual pages.
     Man(ManArgs),
 }
 
-/// Output for other programs.
+/// The option for JSON output.
 #[derive(Args, Clone, Debug)]
 pub struct JsonArgs {
     /// Also write the result to this file as JSON. `-` or no name prints it and nothing else.
@@ -120,7 +120,7 @@ pub struct JsonArgs {
 /// Maximum number of physics threads of a server.
 const MAX_WORKERS: usize = 1024;
 
-/// Servers of the environments.
+/// The options that select or start servers.
 #[derive(Args, Clone, Debug)]
 pub struct ServerArgs {
     /// Addresses of running servers, separated by commas: unix:/path, host:port, http://host:port or tcp://host:port,
@@ -137,11 +137,12 @@ pub struct ServerArgs {
     pub task: Vec<PathBuf>,
 }
 
-/// Waiting for lost servers.
+/// The option for the time to wait for lost servers.
 #[derive(Args, Clone, Copy, Debug)]
 pub struct WaitArgs {
     /// Seconds to wait for lost servers before giving up; 0 does not wait. When a server is back, the work continues
-    /// with the same result. A private server is restarted. With several servers, the ones that are back are used.
+    /// with the same result. A private server is restarted. If several servers are lost, the work continues with those
+    /// that are back.
     #[arg(long, value_name = "SECONDS", default_value_t = Self::DEFAULT_SECONDS, value_parser = natural::<u32>)]
     pub server_wait: u32,
 }
@@ -156,20 +157,20 @@ impl WaitArgs {
     }
 }
 
-/// Servers and acting of trained and tested policies.
+/// Servers that play a policy, and the place where its actions are chosen.
 #[derive(Args, Clone, Debug)]
 pub struct PlayArgs {
     #[command(flatten)]
     pub server: ServerArgs,
     #[command(flatten)]
     pub wait: WaitArgs,
-    /// Place where actions are chosen: at the server for whole rollouts, if it supports that, or in this process at
-    /// every step. It changes no result.
+    /// Place where actions are chosen: in the server for whole rollouts, if it supports that, or in this process at
+    /// every step. Results do not depend on it.
     #[arg(long, value_name = "WHERE", default_value = "server", value_parser = OneOf::new(&["server", "client"]))]
     pub act: String,
 }
 
-/// Parses one of a few names, in any spelling. --help and completions list the names.
+/// A parser of one of a few names. Case, `-` and `_` are ignored. --help and shell completions list the names.
 #[derive(Clone)]
 struct OneOf(Vec<&'static str>);
 
@@ -206,7 +207,7 @@ fn natural<T: TryFrom<u64>>(text: &str) -> Result<T, String> {
     whole_number(text, 0)
 }
 
-/// Parses a whole number that is at least `min` and that `T` can hold.
+/// Parses a whole number that is at least `min` and fits into `T`.
 fn whole_number<T: TryFrom<u64>>(text: &str, min: u64) -> Result<T, String> {
     let number = text.parse::<u64>().ok().filter(|number| *number >= min);
     number.and_then(|number| T::try_from(number).ok()).ok_or_else(|| {

@@ -12,7 +12,7 @@ use perturb_settings::sets::Assignment;
 use super::{JsonArgs, PlayArgs, ServerArgs, WaitArgs, at_least_one, natural, within};
 use crate::video::PIXELS;
 
-/// Parses a success rule. Its name may be spelled in any case.
+/// Parses a success rule. The names `text` and `code` may be written in any case.
 pub(super) fn success_rule(text: &str) -> Result<Rule, ValueError> {
     let known = ["text", "code"];
     names::find(text.trim(), known.into_iter()).map_or(text, |index| known[index]).parse()
@@ -25,7 +25,8 @@ pub(super) fn success_rule(text: &str) -> Result<Rule, ValueError> {
   perturb evaluate --checkpoint runs/mine --parameters length=0.1..2.0/20 --by length --records long.parquet")]
 pub struct EvaluateArgs {
     /// The --out folder of a training, its checkpoint folder, a policy file (.safetensors), the folder of a cell, or a
-    /// policy's name: the id of a cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
+    /// policy's name: the id of a cell in results/ of the working directory, or in the folder that PERTURB_RESULTS
+    /// names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
     /// Versions to test on, separated by commas [default: D,R,E; none with --parameters or --contexts].
@@ -33,8 +34,9 @@ pub struct EvaluateArgs {
     pub versions: Vec<Version>,
     #[command(flatten)]
     pub set: SetArgs,
-    /// Rule that decides about success: `text` for the paper's text, `code` for its published code, or another
-    /// threshold for the quantity that either compares, e.g. steps=90. `perturb envs` lists both rules [default: text].
+    /// Rule that decides about success: `text` for the rule of the paper's text, `code` for that of its published code,
+    /// or another threshold for the quantity of these rules, e.g. steps=90. `perturb envs` lists both rules [default:
+    /// text].
     #[arg(long, value_name = "text|code|QUANTITY=NUMBER", value_parser = success_rule)]
     pub success: Option<Rule>,
     /// Write every test episode to this Parquet file. `perturb audit` replays the episodes, `perturb rescore` applies
@@ -42,11 +44,11 @@ pub struct EvaluateArgs {
     #[arg(long, value_name = "FILE")]
     pub records: Option<PathBuf>,
     /// Number of test episodes on each version or set. A grid or a list has at least one episode in each context. For a
-    /// policy trained with RL² it is the number of trials, of which the last episode counts.
+    /// policy trained with RL² it is the number of trials, and only the last episode of each trial counts.
     #[arg(long, value_name = "N", default_value_t = 1000, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
-    /// Random seed of the tests. Tests draw other environments than trainings, also with the same seed [default: the
-    /// training's seed].
+    /// Random seed of the tests. Tests and trainings never draw the same environments, even with the same seed
+    /// [default: the training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
     /// Test with the episodes that select configurations in experiments with selection = "clean". No other test uses
@@ -63,7 +65,7 @@ pub struct EvaluateArgs {
     pub play: PlayArgs,
 }
 
-/// Sets of parameters other than the versions.
+/// Custom sets of parameters to test on, in addition to the versions.
 #[derive(Args, Clone, Debug)]
 pub struct SetArgs {
     /// Parameters to test on: a value, intervals to draw from, or the points of a grid, e.g. length=0.3..0.4,0.8..0.9
@@ -73,7 +75,7 @@ pub struct SetArgs {
     /// A list of parameters to test on: a CSV file whose header names parameters, with a row for each context.
     #[arg(long, value_name = "FILE", conflicts_with = "parameters")]
     pub contexts: Option<PathBuf>,
-    /// Version that gives the parameters which --parameters or --contexts do not name.
+    /// Version of the parameters that --parameters or --contexts do not name.
     #[arg(long, value_name = "VERSION", default_value = "D")]
     pub base_version: Version,
 }
@@ -89,9 +91,9 @@ pub struct AuditArgs {
     /// folder that `Assessment.save` wrote in Python, or a table of `perturb export --policies`, its folder, or one of
     /// its policies. The tests of a table are replayed as a whole, and their checksums compared.
     pub dir: PathBuf,
-    /// Tested checkpoint of a records file: the --out folder of its training, its checkpoint folder, the folder of its
-    /// cell, or a name in results/ of the working directory or in the folder that PERTURB_RESULTS names. For an
-    /// assessment, give the checkpoints of all policies that perturb trained.
+    /// Tested policy of a records file: the --out folder of its training, its checkpoint folder, the folder of its
+    /// cell, or a policy's name in results/ of the working directory or in the folder that PERTURB_RESULTS names. For
+    /// an assessment, give the checkpoints of all its policies that perturb trained.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
     /// Number of episodes of each policy to replay, evenly spread over the recorded ones.
@@ -100,12 +102,12 @@ pub struct AuditArgs {
     /// Replay all recorded episodes.
     #[arg(long, conflicts_with = "episodes")]
     pub all: bool,
-    /// Replay nothing, but check the ledgers of all servers that trained (`perturb-server --ledger`). They prove that
-    /// the trainings drew from the sets that they state, and never played a test episode or another test set.
+    /// Check the ledgers of all servers that the trainings used (`perturb-server --ledger`), and replay nothing. The
+    /// ledgers prove that a training drew only from its stated set, and played no test episode and no other test set.
     #[arg(long, value_name = "FILE", num_args = 1.., conflicts_with_all = ["episodes", "all"])]
     pub ledger: Vec<PathBuf>,
-    /// Digests that the ledgers must contain: those that a server logged at its end, or that an earlier audit printed.
-    /// They prove that no earlier line was changed.
+    /// Digests that the ledgers must contain. A server logs its ledger's digest when it ends, and an audit prints it. A
+    /// digest proves that no earlier line of the ledger was changed.
     #[arg(long, value_name = "DIGEST", num_args = 1.., requires = "ledger")]
     pub head: Vec<String>,
     #[command(flatten)]
@@ -149,12 +151,12 @@ pub struct HeatmapArgs {
         conflicts_with_all = ["checkpoint", "parameters", "records"]
     )]
     pub dir: Option<PathBuf>,
-    /// Policies of one environment: for each the --out folder of its training, its checkpoint folder, the folder of a
-    /// cell, or a name in results/ of the working directory or in the folder that PERTURB_RESULTS names. The picture
-    /// has a panel for each method and training set, with the mean over its policies.
+    /// Policies of one environment. Each is the --out folder of a training, a checkpoint folder, the folder of a cell, or
+    /// a policy's name in results/ of the working directory or in the folder that PERTURB_RESULTS names. The picture has
+    /// a panel for each method and training set, with the mean over its policies.
     #[arg(long, value_name = "DIR", num_args = 1..)]
     pub checkpoint: Vec<PathBuf>,
-    /// Test only the policies of the first N runs. Existing heatmaps of other runs are drawn, too [default: all runs].
+    /// Test only the policies of the first N runs. Existing heatmaps of other runs are still drawn [default: all runs].
     #[arg(long, value_name = "N", conflicts_with = "checkpoint", value_parser = at_least_one::<u32>)]
     pub runs: Option<u32>,
     /// Parameter along the x axis, e.g. force; `perturb envs` lists them. Environments of DIR without this parameter
@@ -164,7 +166,7 @@ pub struct HeatmapArgs {
     /// Parameter along the y axis, e.g. mass.
     #[arg(long, value_name = "PARAMETER", requires = "x")]
     pub y: Option<String>,
-    /// Version that gives the other parameters. On D each has its default; on R and E they are drawn for each episode.
+    /// Version of all other parameters. On D each has its default; on R and E they are drawn for each episode.
     #[arg(long, value_name = "VERSION", default_value = "D")]
     pub base_version: Version,
     /// Values of other parameters, e.g. force=7 [default: those of --base-version].
@@ -188,9 +190,10 @@ pub struct HeatmapArgs {
     /// Random seed of the tests [default: each training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
-    /// With --checkpoint, path of the files without the extensions .csv, .svg, .png and .parquet [default: in the working
-    /// directory, named after environment, algorithm, architecture, version, seed and parameters]. With DIR, a folder for
-    /// pictures and new heatmaps, e.g. if DIR is somebody else's [default: DIR/report and DIR/heatmaps].
+    /// With --checkpoint, path of the files without the extensions .csv, .svg, .png and .parquet [default: in the
+    /// working directory, named after environment, algorithm, architecture, version, seed and parameters]. With DIR, a
+    /// folder for pictures and new heatmaps, e.g. if DIR belongs to another user [default: DIR/report and
+    /// DIR/heatmaps].
     #[arg(long, value_name = "PATH")]
     pub out: Option<PathBuf>,
     #[command(flatten)]
@@ -206,8 +209,8 @@ pub struct VideoArgs {
     /// cell in results/ of the working directory, or in the folder that PERTURB_RESULTS names.
     #[arg(long, value_name = "DIR")]
     pub checkpoint: PathBuf,
-    /// Versions that give the environment's parameters, separated by commas. A film shows them one after the other, a
-    /// contact sheet side by side.
+    /// Versions of the environment's parameters, separated by commas. A film shows them one after the other, and a
+    /// contact sheet shows them side by side.
     #[arg(long, value_delimiter = ',', default_value = "D")]
     pub version: Vec<Version>,
     /// Parameters that replace the version's: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.

@@ -37,7 +37,7 @@ pub struct TrainArgs {
     /// Name of the environment; `perturb envs` lists them.
     #[arg(long, value_name = "NAME")]
     pub env: Option<String>,
-    /// Version that gives the environment's parameters [default: D].
+    /// Version of the environment's parameters: D (the defaults), R (random), E (extreme) or R+E [default: D].
     #[arg(long)]
     pub version: Option<Version>,
     /// Parameters that replace the version's: a value, or intervals to draw from, e.g. length=0.3..0.4,0.8..0.9
@@ -72,7 +72,7 @@ pub struct TrainArgs {
     /// Delete an existing run in --out first.
     #[arg(long)]
     pub overwrite: bool,
-    /// Number of threads of an update. It changes no result [default: one for each core].
+    /// Number of threads for policy updates. Results do not depend on it [default: one for each core].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=64u16))]
     pub threads: Option<u16>,
     /// A TOML file of settings, e.g. the config.toml of an earlier run.
@@ -92,9 +92,9 @@ pub struct TrainArgs {
         ]
     )]
     pub resume: Option<PathBuf>,
-    /// Extend the budget of a resumed run by this number of episodes. It counts from the budget, or from the finished
-    /// episodes if there are more. With learning_rate_schedule = "constant" the result is that of a training with the
-    /// larger budget. Another schedule continues where it would be in such a training.
+    /// Extend a resumed run by this number of episodes. They are added to the run's budget, or to the number of
+    /// finished episodes if that is larger. With learning_rate_schedule = "constant" the result equals that of one
+    /// training with the larger budget. Another schedule continues as it would in a training with the larger budget.
     #[arg(long, value_name = "EPISODES", value_parser = at_least_one::<u64>)]
     pub extend: Option<u64>,
     #[command(flatten)]
@@ -143,8 +143,8 @@ pub struct LsArgs {
     pub json: JsonArgs,
 }
 
-/// The page changes no files. There is no authentication, so it listens on this machine's own address unless another
-/// one is given. From another machine use a tunnel: ssh -L 8420:localhost:8420 MACHINE.
+/// The page changes no files. It has no authentication, so by default it can be opened only on this machine. On another
+/// machine, use a tunnel: ssh -L 8420:localhost:8420 MACHINE.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   perturb serve                                      # then open http://127.0.0.1:8420
@@ -154,12 +154,11 @@ pub struct ServeArgs {
     /// Folder of the runs, at any depth, or a single run.
     #[arg(value_name = "DIR", default_value = "runs")]
     pub dir: PathBuf,
-    /// Address to listen at: ADDRESS:PORT, or a port of this machine's own address. Port 0 takes a free port and prints
-    /// it.
+    /// Address to listen at: ADDRESS:PORT, or a port of the loopback address. Port 0 takes a free port and prints it.
     #[arg(long, value_name = "ADDRESS", default_value = "127.0.0.1:8420", value_parser = listen_address)]
     pub address: SocketAddr,
-    /// Host names, separated by commas, by which browsers may ask for the page beside localhost, e.g. that of a proxy
-    /// which passes it on. Links are relative, so the proxy may serve the page below any path.
+    /// Host names, separated by commas, at which browsers may open the page in addition to localhost, e.g. the name of
+    /// a reverse proxy. Links are relative, so the proxy may serve the page below any path.
     #[arg(long, value_name = "NAME", value_delimiter = ',')]
     pub host: Vec<String>,
     /// A running perturb-server whose status the page shows: unix:/path, host:port, http://host:port or

@@ -1,4 +1,5 @@
-//! `perturb audit --ledger`.
+//! `perturb audit --ledger`: proves with the servers' ledgers on which environments a policy was trained. A ledger is a
+//! server's log of everything that its sessions drew.
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -13,12 +14,13 @@ use perturb_records::ledger::{Head, Ledgers, Proof};
 use super::super::{args::AuditArgs, display::output, error::CommandError, error::Result, reconnecting_servers};
 use super::{RecordedPolicy, server_args};
 
-/// Prints what the ledgers prove about each policy.
+/// Prints what the ledgers prove about each policy. Returns success if no ledger contradicts a policy.
 pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<ExitCode> {
     let ledgers = Ledgers::read(&args.ledger, &args.head).map_err(CommandError::Failed)?;
     let servers = reconnecting_servers(&server_args(args)?, args.wait, &StopFlag::default())?;
     let mut proofs = Vec::new();
     let mut out = output();
+    // Check that the checkpoint is that of the recorded policy, and compare its training with the ledgers.
     for policy in recorded {
         let name = policy.name.as_str();
         let records = Records::read(&policy.records)?;
@@ -41,6 +43,7 @@ pub(super) fn prove(args: &AuditArgs, recorded: &[RecordedPolicy]) -> Result<Exi
             proofs.last().map_or(Ok(()), |(name, proof)| print(name, proof, &records))?;
         }
     }
+    // A policy is clean if no ledger contradicts it.
     let clean = proofs.iter().filter(|(_, proof)| proof.against.is_empty()).count();
     let policies: Vec<Value> = proofs.iter().map(|(name, proof)| document(name, proof)).collect();
     let heads: Vec<Value> = ledgers.heads().iter().map(head).collect();

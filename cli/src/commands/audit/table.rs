@@ -14,24 +14,26 @@ use super::super::display::Display;
 use super::super::error::{CommandError, Result};
 use super::super::export::POLICIES;
 
-/// The name of a table in a folder of results.
+/// The file name of a results table.
 const TABLE: &str = "results.parquet";
 
-/// A stored policy whose test episodes have checksums in a table.
+/// A stored policy. A results table has the checksums of its test episodes.
 #[derive(Clone, Debug)]
 pub(super) struct ChecksummedPolicy {
-    /// The id of its cell.
+    /// The id of the policy's cell.
     pub(super) name: String,
     checkpoint: PathBuf,
     cell: Cell,
-    /// The names of its tests with the checksums of their episodes.
+    /// The name of each test, with the checksum of its episodes.
     checksums: Vec<(String, String)>,
-    /// The file of its study's recorded episodes, which need not exist.
+    /// The file with the recorded episodes of the policy's study. It need not exist.
     episodes: PathBuf,
 }
 
-/// Returns the table and the policy that `path` means: a folder with a table, a table, a policy file beside one, or the
-/// name of such a policy. Returns `None` for any other path.
+/// Finds a results table, and the id of a policy's cell if `path` means a single policy.
+///
+/// `path` is a table, a folder with a table, a policy file in the folder `policies` beside a table, or the name of such
+/// a policy. Returns `None` for any other path.
 pub(super) fn table_of(path: &Path) -> Result<Option<(PathBuf, Option<String>)>> {
     if path.join("plan.toml").is_file() {
         return Ok(None);
@@ -53,7 +55,7 @@ pub(super) fn table_of(path: &Path) -> Result<Option<(PathBuf, Option<String>)>>
     Ok(Some((table, Some(cell))))
 }
 
-/// Returns the stored policies of `table`, or the one of `cell`.
+/// Returns the stored policies that the table at `path` has checksums of: all, or the policy of `cell`.
 pub(super) fn stored_policies(path: &Path, cell: Option<&str>) -> Result<Vec<ChecksummedPolicy>> {
     let table = ResultsTable::read(path)?;
     let beside = path.parent().unwrap_or(Path::new(""));
@@ -93,7 +95,7 @@ pub(super) fn stored_policies(path: &Path, cell: Option<&str>) -> Result<Vec<Che
 }
 
 impl ChecksummedPolicy {
-    /// Plays all tests again.
+    /// Plays all tests of the policy again, and compares the checksums of their episodes.
     pub(super) fn audit(&self, servers: &Servers, stop: &StopFlag) -> Result<Audit> {
         let checkpoint = Checkpoint::load(&self.checkpoint)?;
         let tests = &self.cell.tests;
@@ -107,6 +109,7 @@ impl ChecksummedPolicy {
             let options = TestOptions { episodes, seed, selects, success: tests.success.clone() };
             Tester::new(servers, &checkpoint, options)?.test(sets, stop, &mut |_, done| display.episodes(done))
         };
+        // The tests on the cell's sets, and then the test that selects configurations.
         let mut replayed = test(&sets, tests.episodes, false)?;
         if let Some((set, episodes)) = selection {
             replayed.append(test(&[set], episodes, true)?);
@@ -115,7 +118,8 @@ impl ChecksummedPolicy {
         self.compare(&replayed)
     }
 
-    /// Compares the checksums of `replayed`. The first differing episode is named if the recorded ones are at hand.
+    /// Compares the checksums of `replayed` with those of the table. If the recorded episodes are stored, too, the
+    /// result names the first episode that differs.
     fn compare(&self, replayed: &Records) -> Result<Audit> {
         let mut audit = Audit { episodes: replayed.episodes.len() as u64, different: Vec::new() };
         let mut recorded = None;

@@ -20,18 +20,18 @@ use crate::commands::display::{note, output, say};
 use crate::commands::error::{CommandError, Result, system};
 use crate::commands::{plan_in, playing_servers, refuse_file, require_default_out, with_tasks_of};
 
-/// Numbers of heatmaps.
+/// Counts for the command's exit status.
 #[derive(Default)]
 struct HeatmapCounts {
-    /// Heatmaps of environments that have both parameters.
+    /// Number of heatmaps of finished cells whose environment has both parameters.
     total: usize,
-    /// Heatmaps that could not be made, although there is a result.
+    /// Number of these heatmaps that could not be made.
     failed: usize,
-    /// Environments without one of the parameters.
+    /// Number of environments that lack one of the parameters.
     skipped_environments: usize,
 }
 
-/// Makes the missing heatmaps, and draws all of them.
+/// Tests the selected policies that have no heatmap yet, and draws the heatmaps of all selected policies.
 pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let mut folder = Folder::new(directory);
     let plan = plan_in(&folder)?;
@@ -46,6 +46,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
             directory.join("report")
         }
     };
+    // A place is a heatmap of the experiment: the policy that was selected for an environment and method in a run.
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);
@@ -55,6 +56,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let mut connected = None;
     let mut counts = HeatmapCounts::default();
+    // Make the missing heatmaps, one environment after the other.
     for places in selected.chunk_by(|a, b| a.environment == b.environment) {
         let (finished, unfinished): (Vec<_>, Vec<_>) = places.iter().partition(|place| place.selected.is_some());
         unfinished.iter().for_each(|place| note(format_args!("{place}: {}", NoHeatmap::NoResult)));
@@ -85,6 +87,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
             counts.failed += usize::from(!make(args, &folder, place, &kind, servers, &stop)?);
         }
     }
+    // Draw the means over runs of all heatmaps, including those that existed before.
     for file in save_heatmaps(&heatmap_pictures(&selections, Some(&folder))?, &report)? {
         writeln!(output(), "{}.png, .svg and .csv", report.join(file).display())?;
     }
@@ -99,7 +102,7 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
     }
 }
 
-/// Returns a sentence about the parameter of --x or --y that an environment does not have.
+/// Returns a sentence if the environment does not have the parameter of --x or --y.
 fn missing_parameter(args: &HeatmapArgs, environment: &proto::Environment) -> Option<String> {
     let known = environment.parameters.iter().map(|parameter| parameter.name.as_str());
     let missing = args.x.iter().chain(&args.y).find(|name| names::find(name, known.clone()).is_none())?;
@@ -108,7 +111,7 @@ fn missing_parameter(args: &HeatmapArgs, environment: &proto::Environment) -> Op
     Some(format!("{} has no parameter `{missing}`{hint}, only {known}", environment.name))
 }
 
-/// Makes a heatmap unless it exists. Returns whether it exists afterwards.
+/// Makes the heatmap of a selected policy unless it exists already. Returns whether it exists afterwards.
 fn make(
     args: &HeatmapArgs,
     folder: &Folder,
@@ -134,14 +137,14 @@ fn make(
         .map_err(|error| CommandError::Heatmaps { place: place.to_string(), source: Box::new(error) })?;
     let id = checkpoint.id().map_err(|reason| CommandError::Failed(format!("{place}: {reason}")))?;
     let path = heatmap_path(folder, selected.cell, kind);
-    // The heatmap's own record is written last, because it marks the heatmap as complete.
+    // `store_heatmap` comes last, because its file marks the heatmap as complete.
     records.write(&path.with_added_extension("parquet"))?;
     store_heatmap(folder, selected.cell, id, options, &heatmap)?;
     writeln!(output(), "{}.csv and .parquet", path.display())?;
     Ok(true)
 }
 
-/// Loads the checkpoint of a result.
+/// Loads the checkpoint of a cell, and checks that it belongs to the cell's result.
 fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
     let state = &checkpoint.state;

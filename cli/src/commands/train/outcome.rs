@@ -27,7 +27,7 @@ pub(super) fn finish(
         Ok(outcome) => outcome,
         Err(error) if error.signal().is_some() => {
             let signal = error.signal().unwrap_or_default();
-            // The sentence of a wait for a server has the error of the server inside.
+            // If a signal ended the wait for a lost server, `source` is the server's error.
             let error = if let TrainError::Stopped { source, .. } = error { *source } else { error };
             let prefix = format!("stopped by signal {signal} while waiting for a server: ");
             let prefix = if error.signal().is_some() { "" } else { &prefix };
@@ -89,7 +89,7 @@ pub(super) fn print_result(
     Ok(writeln!(out, "test it: {command}")?)
 }
 
-/// Prints the training's figures and time shares.
+/// Prints the number of episodes and steps, the means over the last 100 episodes, the speed, and the time shares.
 fn summarise(progress: &Progress) {
     let TimeShares { acting, waiting, updating } = progress.percent();
     let recent = match progress.recent {

@@ -1,4 +1,4 @@
-//! `perturb train --resume`.
+//! `perturb train --resume`: continues a training from its last checkpoint.
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -15,7 +15,7 @@ use super::super::error::{CommandError, Result, system};
 use super::super::{playing_servers, recurrent, threads};
 use super::outcome::{finish, print_result};
 
-/// Maximum number of episodes that a TOML file can hold.
+/// Maximum number of episodes in a budget, because TOML files store 64-bit signed integers.
 const MAX_EPISODES: u64 = i64::MAX as u64;
 
 /// Resumes the run in `path` from its last checkpoint.
@@ -52,7 +52,7 @@ pub(super) fn resume_run(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let report = |progress: &Progress| display.training(progress);
     let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report);
     drop(display);
-    // config.toml gets the larger budget after a checkpoint has it.
+    // config.toml gets the larger budget only once a checkpoint has it.
     let saved = args.extend.and_then(|_| Checkpoint::load(path).ok());
     if saved.is_some_and(|saved| saved.state.config == config) {
         write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
@@ -60,8 +60,8 @@ pub(super) fn resume_run(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     finish(args, &config, &directory, outcome)
 }
 
-/// Returns the budget plus `more` episodes. If more episodes than the budget are trained, it counts from these, because
-/// the last iteration may exceed the budget.
+/// Returns the new budget: `more` episodes in addition to the old budget, or to the `trained` episodes if these are
+/// more. The last iteration of a training may exceed its budget.
 fn extended_budget(budget: u64, trained: u64, more: u64) -> u64 {
     budget.max(trained).saturating_add(more).min(MAX_EPISODES)
 }

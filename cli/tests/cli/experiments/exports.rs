@@ -1,4 +1,4 @@
-//! Exports of a run to a table, and what is done with the table.
+//! Exports of an experiment to a results table, and uses of the table.
 
 use std::path::Path;
 
@@ -16,7 +16,7 @@ fn run(arguments: &[&Path]) -> (Option<i32>, String) {
 
 #[test]
 fn a_run_is_exported_audited_and_continued_from_its_table() {
-    // Two rates that are far apart, so that two short trainings give policies that act differently.
+    // Two very different learning rates make two short trainings give policies that act differently.
     let experiment = Experiment::new(&PLAN.replace("7e-3", "0.1"));
     succeeded(&experiment.run("part", &["--cell", "0,2"]));
     let (part, file) = (experiment.out("part"), experiment.out("table/results.parquet"));
@@ -41,7 +41,7 @@ fn a_run_is_exported_audited_and_continued_from_its_table() {
     let (status, told) = run(&[path("report"), &file.join("other"), path("--out"), &report]);
     assert!(status == Some(2) && told.contains("has no study `other`: give one of them as"), "{told}");
 
-    // All tests of the stored policies give the same checksums, until a policy is another one.
+    // The audit finds equal checksums, until one policy file is replaced by another.
     let audit = || run(&[path("audit"), &experiment.out("table")]);
     let (status, told) = audit();
     assert!(status == Some(0) && told.contains("48 of 48 episodes of 2 policies have the same bytes"), "{told}");
@@ -54,7 +54,7 @@ fn a_run_is_exported_audited_and_continued_from_its_table() {
     let (status, told) = run(&[path("audit"), &policy(0)]);
     assert!(status == Some(1) && told.contains("the episodes have the checksum"), "{told}");
 
-    // Another run does what the table does not have, and their union is the whole.
+    // Another run with --done runs only the cells that the table does not have. Both together have all cells.
     let done = file.to_str().expect("a path");
     let rest = experiment.run("rest", &["--done", done]);
     succeeded(&rest);

@@ -4,9 +4,9 @@ use super::{Experiment, PLAN, succeeded};
 use crate::common::stderr;
 use perturb_faults::disk;
 
-/// Limit on file sizes in blocks of 512 bytes. 16 KiB are too few for a checkpoint's weights.
+/// Limit of file sizes, in blocks of 512 bytes. 16 KiB are too few for a checkpoint's weights.
 const BLOCKS: u32 = 32;
-/// Size of a disk on which a cell can begin but not finish.
+/// Size of a disk on which a cell can begin but not finish, in kilobytes.
 const KILOBYTES: u32 = 120;
 
 #[test]

@@ -1,4 +1,4 @@
-//! Events of the cells of a group.
+//! Events of cells that run together in a group.
 
 use perturb_experiment::scheduler::CellEvent;
 use perturb_experiment::{Failure, FailureId, Folder};
@@ -9,8 +9,8 @@ use perturb_learner::client::Servers;
 use super::{Experiment, PLAN};
 use crate::common::{kill, server};
 
-/// Runs these cells as a group, each with the failure that it may retry. Returns the end of each cell in the plan's
-/// order.
+/// Runs cells as a group. Each cell is given with the earlier failure that it may retry. Returns the last event of each
+/// cell, in the order of the plan.
 fn ends(
     experiment: &Experiment,
     servers: &Servers,
@@ -57,7 +57,7 @@ fn each_cell_of_a_group_ends_once() {
     assert_eq!(ends(&experiment, &servers, &all, &stop), expected);
     drop(lock);
 
-    // One cell is stopped, then the server is lost, and then there is another server.
+    // First a cell is stopped, then the server is lost, and then another server is started.
     let left = [(1, None), (2, place(2).failure_id())];
     stop.raise(15);
     let stopped = CellEvent::Stopped { signal: 15 };

@@ -9,8 +9,8 @@ use perturb_learner::checkpoint::Checkpoint;
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{perturb, wait_for};
 
-/// A plan with two cells that reach every number of episodes exactly, and one of EPOpt, which learns from a part of its
-/// episodes.
+/// A plan with two cells that reach the numbers of episodes in `evaluate_at` exactly, and a cell of EPOpt, which learns
+/// only from a part of its episodes.
 const PLAN: &str = "
 environments = ['CartPole']
 versions = ['D']
@@ -105,7 +105,7 @@ fn intermediate_evaluations_survive_kills() {
     assert!(output.stdout.starts_with(b"108 of 108 episodes of 9 policies"), "{output:?}");
 }
 
-/// With a constant learning rate, a training equals the beginning of one with a larger budget.
+/// With a constant learning rate, a training equals the beginning of a training with a larger budget.
 #[test]
 fn an_intermediate_policy_is_that_of_a_shorter_training() {
     let shorter = PLAN.replace("30, 60]", "30]").replace("= 60", "= 30");
@@ -129,7 +129,7 @@ fn an_intermediate_policy_is_that_of_a_shorter_training() {
     assert_eq!(long.cell_result("out", 0).marks[&30].counters.episodes, 30, "reached exactly");
 }
 
-/// A deleted policy is made again.
+/// If the stored policy of an intermediate evaluation is deleted, the run makes it again.
 #[test]
 fn a_training_without_its_intermediate_policies_restarts() {
     let experiment = Experiment::new(PLAN);

@@ -93,12 +93,12 @@ impl Experiment {
         }
     }
 
-    /// Returns how often each cell's training was begun or resumed. A group has the log of its first cell.
+    /// Returns how often each cell's training was begun or resumed. The log of a group is in the folder of its first cell.
     fn attempts(&self, name: &str) -> Vec<usize> {
         let folder = Folder::new(&self.out(name));
         let log = |cell: &Cell| std::fs::read_to_string(folder.cell(&cell.id).log()).unwrap_or_default();
         let logs: String = self.plan.cells.iter().map(log).collect();
-        // The warning about a missing checkpoint names the folder, too, and does not count.
+        // The warning about a missing checkpoint also contains the folder's name, and does not count.
         let begins =
             |line: &&str| ["begins", "goes on"].iter().any(|how| line.contains(&format!("training {how} directory=")));
         let lines: Vec<&str> = logs.lines().filter(begins).collect();
@@ -120,7 +120,7 @@ fn children(parent: u32) -> Vec<u32> {
 
 /// Kills a run with SIGKILL, and waits until all its processes have ended.
 fn kill_all(mut child: Child) {
-    // There may be none for a moment between two processes.
+    // Between two worker processes there may be no child for a moment.
     let started = children(child.id());
     kill("-KILL", child.id());
     assert_eq!(child.wait().expect("ended").signal(), Some(9), "killed before its end");

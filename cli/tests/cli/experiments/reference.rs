@@ -1,4 +1,4 @@
-//! Rows of a report for comparison.
+//! Cells for comparison in reports: the random policy, policies that observe parameters, and training on R+E.
 
 use perturb_settings::Observe;
 
@@ -51,7 +51,7 @@ fn random_policies_are_tested_reported_and_replayed() {
     succeeded(&output.expect("ended"));
 }
 
-/// A plan with two learners, of which one observes parameters, and the random policy.
+/// A plan with a learner that observes parameters, a learner that does not, and the random policy.
 const SEEING: &str = "
 environments = ['Pendulum']
 versions = ['R']

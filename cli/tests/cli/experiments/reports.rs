@@ -44,7 +44,8 @@ fn reports_do_not_depend_on_interruptions() {
 
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
     let whole_page = (page.matches("<svg").count(), page.matches("<table").count());
-    // Three findings, profiles, curves, parameters; three tables of metrics, two of scenarios, interquartile means.
+    // Pictures: three findings, a profile, eight curves, four of parameters. Tables: three of metrics, two of
+    // scenarios, one of interquartile means.
     assert_eq!(whole_page, (3 + 1 + 8 + 4, 3 + 2 + 1), "every picture and table");
     let pictures = ["profiles.png", "Pendulum-E-parameters.svg"];
     assert!(pictures.iter().all(|name| whole.contains_key(*name)), "{:?}", whole.keys());
@@ -57,7 +58,7 @@ fn reports_do_not_depend_on_interruptions() {
     assert_eq!(page.matches(".svg\" href=\"data:image/svg+xml").count(), 16, "each picture as a file");
     assert_eq!(page.matches(".csv\" href=\"data:text/csv").count(), 16, "and its numbers");
     let metrics = String::from_utf8_lossy(&whole["metrics.csv"]).into_owned();
-    // Nothing was trained on R: Interpolation and Extrapolation are empty, not 0.
+    // No policy was trained on R, so Interpolation and Extrapolation are empty, and not 0.
     assert!(metrics.lines().any(|line| line == "CartPole,a2c,ff,,Interpolation,0,,,,,1,,,100,0,"), "{metrics}");
 }
 
@@ -118,7 +119,7 @@ fn a_heatmap_needs_two_known_parameters() {
         .collect();
     assert_eq!(table.lines().next(), Some("force,length,mean_return,success_percent"));
     assert_eq!(rows.len(), 9);
-    // E's force is 1 … 20: three parts, whose middles are 4.17, 10.5 and 16.83.
+    // R and E together have forces of 1 … 20. The centres of three equal bins are 4.17, 10.5 and 16.83.
     assert!((rows[0][0] - (1.0 + 19.0 / 6.0)).abs() < 1e-12 && rows[1][0] == 10.5 && rows[3][0] == rows[0][0]);
     assert!(rows.iter().all(|row| row[2] >= 1.0), "a step pays 1");
     assert!(String::from_utf8(read(".svg")).expect("text").starts_with("<svg") && read(".png").starts_with(b"\x89PNG"));
@@ -243,7 +244,7 @@ fn embedded(page: &str) -> Vec<&str> {
     names.filter(|name| name.contains("mean return and success over ")).collect()
 }
 
-/// Makes heatmaps. Returns the number of new ones and of existing ones.
+/// Makes heatmaps. Returns the number of new heatmaps and the number of existing heatmaps.
 fn made(experiment: &Experiment, arguments: &[&str]) -> (usize, usize) {
     let output = experiment.heatmap("out", arguments);
     succeeded(&output);
@@ -282,7 +283,7 @@ fn heatmaps_of_an_experiment_are_made_once() {
         assert_eq!(text(&picture.with_extension("csv")).lines().count(), 9, "two columns of four points");
     }
 
-    // Incomplete figures are made again, and so are those of a replaced result.
+    // Heatmaps with damaged files are made again, and so are heatmaps of a replaced result.
     let damaged = first.keys().find(|path| path.extension().is_some_and(|ending| ending == "csv")).expect("one");
     std::fs::write(damaged, b"mass,").expect("written");
     assert!(experiment.page("out").contains("not there: 1 of 8."));

@@ -1,4 +1,4 @@
-//! A run finishes each of its cells once, in spite of interruptions.
+//! A run finishes each of its cells exactly once, in spite of interruptions.
 
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
@@ -126,7 +126,7 @@ fn a_failed_cell_has_a_reason_and_the_others_run() {
     assert_eq!(experiment.attempts("out")[failed.index], 2 * attempts[failed.index]);
 }
 
-/// Two simultaneous runs with --retry-failed run each failed cell once, in one of them.
+/// Two simultaneous runs with --retry-failed run each failed cell only once in total.
 #[test]
 fn two_simultaneous_retries_run_each_cell_once() {
     let experiment = Experiment::new(&PLAN.replace("7e-3, 7e-4", "1e38, 2e38"));
@@ -233,7 +233,7 @@ fn a_run_restarts_its_private_server_with_same_results() {
     let mut killed = None;
     let mut at_its_end = None;
     for _ in 0..2 {
-        // A different process means that the next server is in use.
+        // The checkpoint differs once the training continues on the next server.
         wait_for("a checkpoint", || checkpoint().is_some_and(|it| at_its_end.as_ref() != Some(&it)));
         let mut server = None;
         wait_for("a private server", || {
@@ -317,7 +317,7 @@ fn named_cells_run_and_unfinished_ones_are_listed() {
     assert_eq!(listed.as_array().map(Vec::len), Some(6));
     assert_eq!(listed[1], serde_json::json!({ "index": 2, "id": ids[2] }));
 
-    // --cell does not replace the folder's plan, because its own may be older.
+    // With --cell the run does not replace the plan in the folder, because its own plan may be older.
     let kept = || std::fs::read_to_string(experiment.out("out/plan.toml")).expect("a plan");
     std::fs::write(experiment.out("file.toml"), format!("{PLAN}\n# extended")).expect("written");
     for arguments in [&["--cell", "0", "--jobs", "1"][..], &["--cell", "0"]] {
@@ -384,7 +384,7 @@ fn plan_prints_counts_and_an_estimate() {
     assert!(text.contains("8 cells in 4 groups of 2, 2 at a time") && text.contains("measured: 2 groups"), "{text}");
     assert!(text.contains("at most, if every episode") && text.contains(" with --jobs 2\n"), "{text}");
 
-    // Finished cells give the duration of others of their kind.
+    // The durations of finished cells are used for other cells of the same kind.
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let out = experiment.out("out").display().to_string();
     let text = printed(&["plan", &file, "--measure", "1", "--timings-from", &out]);

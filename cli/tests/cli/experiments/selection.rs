@@ -26,7 +26,7 @@ grid = { learning_rate = [7e-3, 7e-4] }
 ";
 
 impl Experiment {
-    /// Returns all cells of the plan, with those that the folder's results select.
+    /// Returns all cells of the plan, including the cells that the folder's results select.
     fn cells(&self, name: &str) -> Vec<Cell> {
         self.plan.with_selected_cells(&Folder::new(&self.out(name))).expect("readable").cells
     }

@@ -1,4 +1,4 @@
-//! Servers of runs: restarted ones and private ones.
+//! Experiments whose servers are restarted, and experiments with private servers.
 
 use std::fs::File;
 

@@ -44,7 +44,8 @@ fn an_early_stop_equals_a_training_of_that_budget() {
     let weights = |experiment: &Experiment| Checkpoint::load(&training(experiment)).expect("a checkpoint").weights;
     assert!(weights(&early) == weights(&plain), "and its policy");
 
-    // A stopped training is not continued, neither by `perturb train` nor by a run that has lost the result.
+    // A training that stopped at its success rate is not continued, either by `perturb train --resume` or by a run
+    // whose result was deleted.
     let output = perturb(&["train", "--resume"]).arg(training(&early)).output().expect("ended");
     let said = stderr(&output);
     assert!(said.contains(&format!("it has {episodes} of 2000 episodes and stopped at ")), "{said}");

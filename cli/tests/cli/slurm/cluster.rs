@@ -11,7 +11,7 @@ use crate::common::wait_within;
 use tempfile::TempDir;
 
 const PROGRAMS: [&str; 6] = ["munged", "slurmctld", "slurmd", "sbatch", "squeue", "sinfo"];
-/// Time that the daemons have to connect to each other.
+/// Maximum time for the daemons to connect to each other.
 const START_LIMIT: Duration = Duration::from_secs(60);
 
 pub struct Cluster {
@@ -20,7 +20,7 @@ pub struct Cluster {
     daemons: Vec<Child>,
 }
 
-/// Returns the path of a program: on the PATH, or in Debian's folders for daemons.
+/// Returns the path of a program in PATH, or in Debian's folders for daemons.
 fn find(program: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let directories = std::env::split_paths(&path).chain(["/usr/sbin".into()]);
@@ -73,7 +73,7 @@ impl Cluster {
         cluster
     }
 
-    /// Returns one of Slurm's commands.
+    /// Returns a command that runs one of Slurm's programs in this cluster.
     pub fn command(&self, program: &str) -> Command {
         let mut command = Command::new(find(program).unwrap_or_else(|| program.into()));
         command.env("SLURM_CONF", self.configuration()).stdin(Stdio::null());
@@ -84,7 +84,7 @@ impl Cluster {
         self.directory.path().join("slurm.conf")
     }
 
-    /// Returns the indices of the array's jobs that run on a node.
+    /// Returns the indices of the jobs that run on a node, in their job array.
     pub fn running_on(&self, node: &str) -> Vec<usize> {
         let mut command = self.command("squeue");
         let output: Output =
@@ -115,7 +115,7 @@ impl Cluster {
     }
 
     fn daemon(&mut self, program: &str, arguments: &[String]) {
-        // If the test is killed, the kernel ends the daemons.
+        // setpriv makes the kernel end the daemons if the test is killed.
         let mut command = self.command("setpriv");
         command.args(["--pdeathsig", "KILL"]).arg(find(program).expect("installed")).args(arguments);
         let log =

@@ -18,9 +18,9 @@ use tempfile::TempDir;
 use self::cluster::Cluster;
 use crate::common::{kill, perturb, stderr, wait_within};
 
-/// Environment variable. With the value 1 the tests fail if Slurm is missing.
+/// Environment variable. If it is set, the tests fail if Slurm is missing; otherwise they are skipped.
 const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";
-/// Environment variable with another experiment file than [`PLAN`], e.g. experiments/quick.toml.
+/// Environment variable with the path of an experiment file to use in place of [`PLAN`], e.g. experiments/quick.toml.
 const PLAN_FILE: &str = "PERTURB_SLURM_PLAN";
 /// Upper bound of every wait.
 const LIMIT: Duration = Duration::from_secs(1800);
@@ -93,13 +93,13 @@ impl Experiment {
         self.plan.cells.iter().filter_map(|cell| Some((&*cell.id, read(&cell.id)?))).collect()
     }
 
-    /// Returns the logs of the cells' processes. A group has the log of its first cell.
+    /// Returns the logs of the cells' processes. The log of a group is in the folder of its first cell.
     fn logs(&self, name: &str) -> String {
         let log = |cell: &Cell| fs::read_to_string(self.cell(name, &cell.id).join("log.txt")).unwrap_or_default();
         self.plan.cells.iter().map(log).collect()
     }
 
-    /// Returns the number of lines with these words about a cell.
+    /// Returns the number of log lines that contain `words` and a cell's id.
     fn said(&self, name: &str, id: &str, words: &str) -> usize {
         self.logs(name).lines().filter(|line| line.contains(words) && line.contains(&format!("/{id}/"))).count()
     }
@@ -118,7 +118,7 @@ impl Experiment {
         files
     }
 
-    /// Returns the cells of the jobs of the only array.
+    /// Returns the ids of the cells in each job of the run's only job array.
     fn jobs(&self, name: &str) -> Vec<Vec<String>> {
         let text = fs::read_to_string(self.out(name).join("slurm/1/cells.txt")).expect("a list");
         text.lines().map(|line| line.split(',').map(str::to_owned).collect()).collect()
@@ -129,17 +129,17 @@ fn end(child: Child) -> Output {
     child.wait_with_output().expect("ended")
 }
 
-/// Returns the inode and the modification time of a file. Another file would differ.
+/// Returns the inode and the modification time of a file, which differ if the file is written again.
 fn identity(path: &Path) -> Option<(u64, i64, i64)> {
     fs::metadata(path).ok().map(|data| (data.ino(), data.mtime(), data.mtime_nsec()))
 }
 
-/// Prints a message of the test. cargo hides the output of `println!`, but not this one.
+/// Prints a message of the test in a way that cargo does not hide, in contrast to `println!`.
 fn say(sentence: &str) {
     let _ = writeln!(std::io::stderr(), "{sentence}");
 }
 
-/// Whether Slurm is not installed, which a test may only find where it is not required.
+/// Tells whether Slurm is missing. Panics if it is missing although [`REQUIRED`] is set.
 fn is_missing() -> bool {
     let Some(missing) = Cluster::missing() else { return false };
     assert!(std::env::var_os(REQUIRED).is_none(), "{missing}, but {REQUIRED} is set: use `make slurm-test`");
@@ -187,7 +187,7 @@ fn a_plan_survives_the_loss_of_a_node() {
     shared_server(&experiment, &cluster);
 }
 
-/// Ctrl-C leaves the jobs alone, and the same command finds them again.
+/// Interrupts a run with Ctrl-C and starts it again. The jobs continue to run, and the second command watches them.
 fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Child {
     let arguments = ["--cells-per-job", "2", "--time", "2:00:00"];
     let first = experiment.on(cluster, "slurm", &arguments).spawn().expect("started");
@@ -199,7 +199,8 @@ fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Ch
     experiment.on(cluster, "slurm", &arguments).spawn().expect("started")
 }
 
-/// Waits for a cell whose training on node n1 has begun and will not end before the node is killed.
+/// Waits until the training of a cell runs on node n1, and returns the cell's id. The training will not end before the
+/// node is killed.
 fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut Child) -> String {
     let jobs = experiment.jobs("slurm");
     let in_work = |id: &String| {
@@ -223,7 +224,7 @@ fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut C
     victim.expect("a cell")
 }
 
-/// Checks that the results are equal, byte for byte.
+/// Checks that the results and the report equal those of a local run, byte for byte.
 fn same_results_and_report(experiment: &Experiment) {
     assert_eq!(experiment.results("whole").len(), experiment.plan.cells.len());
     assert!(experiment.results("slurm") == experiment.results("whole"), "results differ");
@@ -235,7 +236,7 @@ fn same_results_and_report(experiment: &Experiment) {
     }
 }
 
-/// Returns the job that Slurm moved to the other node. Checks that nothing was submitted twice.
+/// Returns the index of the job that Slurm moved to the other node. Checks that no job was submitted twice.
 fn job_that_moved(experiment: &Experiment) -> usize {
     assert!(!experiment.out("slurm/slurm/2").exists());
     let moved: Vec<usize> = (0..experiment.jobs("slurm").len())
@@ -260,13 +261,13 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     let told: String = (0..experiment.jobs("slurm").len()).map(told).collect();
     for cell in &experiment.plan.cells {
         let said = |words: &str| experiment.said("slurm", &cell.id, words);
-        // The warning about a missing checkpoint names the folder, too, and does not count.
+        // The warning about a missing checkpoint also contains the folder's name, and does not count.
         let begun = said("training begins directory=");
         let gone_on = said("training goes on directory=");
         if cell.id == victim {
             assert_eq!((begun, gone_on), (1, 1), "{}", cell.id);
         } else {
-            // Other trainings of its group may have had no checkpoint yet, and begin again.
+            // Other trainings of the group may not have had a checkpoint, so they begin again.
             let most = 1 + usize::from(moved.contains(&cell.id));
             let logs = experiment.logs("slurm");
             assert!(
@@ -280,7 +281,7 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     }
 }
 
-/// Errors of Slurm are printed as they are, and no files are left.
+/// Checks that Slurm's error messages are printed unchanged, and that no files are left.
 fn refusals(experiment: &Experiment, cluster: &Cluster) {
     for (option, value, words) in
         [("--partition", "nowhere", "invalid partition"), ("--array-limit", "0", "expected a whole number, at least 1")]
@@ -315,11 +316,11 @@ fn jobs_serve_the_task_folders_of_a_plan() {
     say("a plan over two tasks from folders has the same results on Slurm");
 }
 
-/// Jobs share a server on the remaining node. The number of cells in a job is estimated.
+/// Checks a run whose jobs share a server on the remaining node. The run estimates the number of cells in a job.
 fn shared_server(experiment: &Experiment, cluster: &Cluster) {
     let server = PrivateServer::start(None).unwrap_or_else(|error| panic!("{error}"));
     let id = &experiment.plan.cells[0].id;
-    // The other cells have results already.
+    // The first cell remains to be run, because the others get results here.
     for cell in &experiment.plan.cells[1..] {
         let from = experiment.cell("slurm", &cell.id);
         let to = experiment.cell("shared", &cell.id);
@@ -327,7 +328,7 @@ fn shared_server(experiment: &Experiment, cluster: &Cluster) {
         fs::copy(from.join("result.json"), to.join("result.json")).expect("copied");
     }
     let mut command = experiment.on(cluster, "shared", &["--server", &server.address().to_string()]);
-    // A job with a private server would fail.
+    // With this variable, a job that starts a private server would fail.
     let output = end(command.env("SBATCH_EXPORT", "ALL,PERTURB_SERVER=/nowhere").spawn().expect("started"));
     assert!(output.status.success(), "{}", stderr(&output));
     assert_eq!(experiment.jobs("shared"), [vec![id.clone()]]);
