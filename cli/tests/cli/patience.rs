@@ -207,7 +207,7 @@ fn a_training_over_breaking_lines_needs_no_checkpoint(#[case] text: &str, #[case
     let said = std::fs::read_to_string(said).expect("words");
     assert!(status.success(), "{status}: {said}");
     assert!(!said.contains("waiting for it"), "it went back: {said}");
-    assert!(said.contains("took the session up again"), "nobody heard of it: {said}");
+    assert!(said.contains("resumed the session"), "nobody heard of it: {said}");
     assert!(line.faults() >= 5, "{} cuts", line.faults());
     assert_eq!(result(&out), undisturbed(text), "after {} cuts", line.faults());
 }

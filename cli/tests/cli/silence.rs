@@ -63,7 +63,7 @@ fn a_session_resumes_when_a_silent_server_answers_again() {
     let status = ended(child).status;
     let said = std::fs::read_to_string(said).expect("words");
     assert!(status.success(), "{status}: {said}");
-    assert!(said.contains("took the session up again") && !said.contains("waiting for it"), "{said}");
+    assert!(said.contains("resumed the session") && !said.contains("waiting for it"), "{said}");
     assert_eq!(result(&out), undisturbed(A2C_PENDULUM));
 }
 

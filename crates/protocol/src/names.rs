@@ -61,8 +61,8 @@ pub enum UnknownEnvironment {
     },
     /// The server's environment has another revision than the id.
     #[error(
-        "`perturb/{name}-v{asked}` is another revision than that of the server, `perturb/{name}-v{served}`: write that, \
-         or just `{name}`, or run a server of the revision"
+        "`perturb/{name}-v{asked}` is another revision than the server's `perturb/{name}-v{served}`: write \
+         `perturb/{name}-v{served}` or `{name}`, or run a server that has revision {asked}"
     )]
     Revision {
         /// The environment's name.

@@ -82,7 +82,7 @@ requests! {
     Release => Released, Release, Release, "release", "to release environments";
     Act => Acted, Act, Act, "act", "to act";
     SavePlayer => PlayerSaved, SavePlayer, SavePlayer, "save_player", "to save a player";
-    Resume => Resumed, Resume, Resumed, "resumed", "to take up a session";
+    Resume => Resumed, Resume, Resumed, "resumed", "to resume a session";
 }
 
 /// A client's session on a server. Requests may be sent before earlier replies are received. Replies are received in
@@ -268,7 +268,7 @@ impl Stream {
     /// Returns the next message from the server. With a lease, first resumes the session if its stream is lost.
     async fn message<A: TypedRequest>(&mut self) -> Result<Option<SessionResponse>, ClientError> {
         let limit = self.connection.timeouts().reply;
-        let mut taken_up = 0;
+        let mut resumptions = 0;
         loop {
             let next = match self.unrequested.take() {
                 Some(ended) => ended,
@@ -287,18 +287,19 @@ impl Stream {
             };
             // Only a session with a lease whose connection failed can be resumed, and not too often without a reply.
             let error = lost(self.connection.address(), A::NAME, &status);
+            // Only a failure of the connection can be resumed, not a status that the server sent.
             let Some(lease) = self
                 .lease
                 .as_mut()
-                .filter(|_| lease::is_of_connection(&status) && taken_up < MAX_RESUMES_WITHOUT_REPLY)
+                .filter(|_| lease::is_of_connection(&status) && resumptions < MAX_RESUMES_WITHOUT_REPLY)
             else {
                 return Err(error);
             };
             match lease.resume(&self.connection).await {
-                Some(line) => {
-                    tracing::warn!("{error}; took the session up again");
-                    self.raw = line;
-                    taken_up += 1;
+                Some(resumed) => {
+                    tracing::warn!("{error}; resumed the session");
+                    self.raw = resumed;
+                    resumptions += 1;
                 }
                 None => {
                     self.lease = None;
@@ -337,8 +338,8 @@ impl Stream {
         Ok(())
     }
 
-    /// Creates the error for a reply to a request of type `A` that violates the protocol: what it contains, and what it
-    /// should contain.
+    /// Creates the error for a reply to a request of type `A` that violates the protocol. `got` describes the reply,
+    /// `expected` the reply that the protocol requires.
     pub fn mismatch<A: TypedRequest>(&self, got: String, expected: String) -> ClientError {
         ClientError::Protocol { address: self.address().clone(), request: A::NAME, got, expected }
     }
