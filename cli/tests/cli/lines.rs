@@ -13,9 +13,9 @@ use crate::patience::PPO_CART_POLE;
 
 /// Number of connections with a fault. Later connections have none, so that the training can finish.
 const FAULTY: usize = 4;
-/// Minimum number of bytes before the first fault of a connection. If its first requests failed, the client would end
-/// at once instead of reconnecting.
-const BEGUN: usize = 20_000;
+/// The minimum number of bytes before the fault of the first connection. The reply to its first request, the catalogue,
+/// has 21 kB. If the first requests failed, the client would end at once instead of reconnecting.
+const BEGUN: usize = 64_000;
 /// Maximum number of bytes before a fault. A training's connection carries more bytes in both directions.
 const MOST: u64 = 200_000;
 
