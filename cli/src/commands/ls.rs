@@ -3,6 +3,7 @@
 use std::io::Write;
 
 use perturb_experiment::runs::{RunSummary, no_folder, places};
+use perturb_system::escape_terminal;
 use perturb_text::{Table, grouped};
 
 use super::args::LsArgs;
@@ -30,6 +31,8 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     if found.is_empty() {
         return Ok(writeln!(out, "{} has no trainings, experiments or assessments", args.dir.display())?);
     }
+    // A path with a line break would be two rows.
+    let path = |found: &RunSummary| escape_terminal(&found.path.display().to_string()).into_owned();
     let done = |found: &RunSummary| {
         if found.unit.is_empty() {
             // A run whose files are damaged has no unit.
@@ -40,7 +43,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     };
     // A table if it fits into the terminal, and otherwise two lines for each run.
     let table = Table::builder("", &found)
-        .text("run", |found| found.path.display())
+        .text("run", path)
         .text("what", |found| &found.what)
         .number("done", done)
         .number("success, %", |found| found.success_percent.map_or_else(String::new, |percent| format!("{percent:.1}")))
@@ -54,7 +57,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
         let success = found.success_percent.map(|percent| format!("success {percent:.1} %"));
         let words = [found.what.clone(), done(found), success.unwrap_or_default(), found.state.to_owned()];
         let words: Vec<String> = words.into_iter().filter(|words| !words.is_empty()).collect();
-        writeln!(out, "{}\n  {}", found.path.display(), words.join(", "))?;
+        writeln!(out, "{}\n  {}", path(found), words.join(", "))?;
     }
     Ok(writeln!(out, "{SUCCESS_NOTE}")?)
 }

@@ -21,7 +21,7 @@ pub type Parameters = BTreeMap<String, Distribution>;
 pub type Context = BTreeMap<String, f64>;
 
 /// Maximal number of contexts in a set. It is limited because the environments of all contexts run together.
-const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
+pub const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 
 /// A parameter set that a policy is tested on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

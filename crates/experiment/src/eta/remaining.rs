@@ -66,7 +66,9 @@ pub(crate) fn remaining_time(
         longest = longest.max(if one.elapsed_seconds.is_some() { rest / share } else { rest });
     }
     let at_a_time = at_a_time.clamp(1, cells.len().max(1)) as f64;
-    Some(RemainingTime { time: Duration::from_secs_f64((seconds / at_a_time).max(longest)), at_most })
+    // Absurd budgets take longer than a duration can be.
+    let time = Duration::try_from_secs_f64((seconds / at_a_time).max(longest)).unwrap_or(Duration::MAX);
+    Some(RemainingTime { time, at_most })
 }
 
 #[cfg(test)]
@@ -140,5 +142,6 @@ mod tests {
         assert_eq!(of(&[begun(), waits(Some(70.0))]).unwrap().time, Duration::from_secs(80));
         assert!(of(&[begun(), waits(Some(70.0))]).unwrap().at_most);
         assert_eq!(of(&[begun(), waits(None)]), None);
+        assert_eq!(of(&[begun(), waits(Some(1e300))]).unwrap().time, Duration::MAX, "of absurd budgets");
     }
 }

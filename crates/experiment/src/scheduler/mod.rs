@@ -640,8 +640,8 @@ fn test_episodes(cell: &Cell, before: Option<&str>) -> f64 {
     let mut names = names.chain(selection.map(|_| SELECTION_TEST.to_owned()));
     let tests = names.position(|name| Some(name.as_str()) == before);
     match tests {
-        Some(tests) => (tests as u64 * episodes) as f64,
-        None => (((1 + marks.len()) * sets.len()) as u64 * episodes + selection.unwrap_or_default()) as f64,
+        Some(tests) => tests as f64 * *episodes as f64,
+        None => ((1 + marks.len()) * sets.len()) as f64 * *episodes as f64 + selection.unwrap_or_default() as f64,
     }
 }
 

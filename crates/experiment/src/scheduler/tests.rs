@@ -567,3 +567,13 @@ fn cells_of_a_group_share_the_time_of_its_process() {
     // three cells has had 2 s of process time.
     assert_eq!((left(2), left(3), left(9)), (Some(30), Some(30), Some(24)));
 }
+
+#[test]
+fn test_episodes_are_counted_without_overflow() {
+    const MANY: f64 = i64::MAX as f64; // the most that TOML can say
+    let plan =
+        PLAN.replace("runs = 2", &format!("runs = 1\ntest_episodes = {}\ntest_versions = ['D', 'R', 'E']", i64::MAX));
+    let plan = Plan::parse("test", plan).unwrap();
+    assert_eq!(test_episodes(&plan.cells[0], None), 3.0 * MANY);
+    assert_eq!(test_episodes(&plan.cells[0], Some("E")), 2.0 * MANY);
+}

@@ -15,7 +15,8 @@ const MAX_QUOTED_LETTERS: usize = 60;
 /// # Errors
 /// [`ValueError`] with the number of the faulty line.
 pub fn set_of_csv(name: &str, version: Version, content: &[u8]) -> Result<TestSet, ValueError> {
-    let lines = text(name, content)?.lines().zip(1..);
+    let text = text(name, content)?.replace("\r\n", "\n");
+    let lines = text.split(['\n', '\r']).zip(1..); // programs for old Macs end lines by \r alone
     let mut lines = lines.filter(|(line, _)| !line.trim().is_empty());
     let expected = "a header of parameters, then a row for each context";
     let (first, number) = lines.next().ok_or_else(|| ValueError::new(name, "empty", expected))?;
@@ -81,6 +82,9 @@ fn context(name: &str, line: u64, header: &[String], values: &StringRecord) -> R
 
 /// Splits a line into its fields, which may be in quotation marks.
 fn fields(what: &str, line: &str) -> Result<StringRecord, ValueError> {
+    let is_complete = line.matches('"').count() % 2 == 0;
+    let got = format!("`{}`, with a quoted value that does not end", quoted(line));
+    require(is_complete, what, got, "values within their line")?;
     let mut fields = StringRecord::new();
     let mut reader = ReaderBuilder::new().has_headers(false).from_reader(line.as_bytes());
     let read = reader.read_record(&mut fields);
@@ -117,6 +121,8 @@ mod tests {
     #[case::crlf("length,mass\r\n0.5,0.1\r\n1,0.2\r\n")]
     #[case::byte_order_mark("\u{feff}length,mass\n0.5,0.1\n1,0.2")]
     #[case::quoted("\"length\",\"mass\"\n\"0.5\",\"0.1\"\n\"1\",\"0.2\"")]
+    #[case::cr("length,mass\r0.5,0.1\r1,0.2\r")]
+    #[case::mixed("length,mass\n0.5,0.1\r1,0.2\r\n")]
     #[case::blank_lines("\nlength,mass\n\n0.5,0.1\n  \n\n+1e0,.2\n\n")]
     fn rows_of_a_file_are_contexts(#[case] text: &str) {
         assert_eq!(listed(text), rows(&[(0.5, 0.1), (1.0, 0.2)]));
@@ -136,6 +142,12 @@ mod tests {
     #[case("length\n\"1,000\"\n", "line 2 is `1,000`, but must be a number with a decimal point")]
     #[case("length;mass\n0,3;0,1\n", "with columns separated by ';', but must be names separated by commas")]
     #[case(",length\n0,0.3\n", "column 1 has no name, but must be a name for each column: leave out the index")]
+    #[case("length\r\n0.3\r\n\r\nnought\r\n", "length in line 4 is `nought`")]
+    #[case(
+        "length\n\"0.3\n\"\n",
+        "line 2 is `\"0.3`, with a quoted value that does not end, but must be values within"
+    )]
+    #[case("\"len\ngth\"\n0.3\n", "the header in line 1 is `\"len`, with a quoted value that does not end")]
     #[case("length,\n0.3,\n", "column 2 has no name, but must be a name for each column: leave out the comma")]
     fn a_fault_is_named_with_its_line_and_cause(#[case] text: &str, #[case] part: &str) {
         let error = set_of_csv("rows", Version::R, text.as_bytes()).unwrap_err().to_string();

@@ -188,7 +188,9 @@ impl QueueAnswer {
     fn parse(text: &str) -> Result<Self, SlurmError> {
         let mut answer = Self::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
-            if line.contains(SEPARATOR) {
+            // A banner may have the separator, too. What begins with a number is a job, and must be understood.
+            let first = line.split_once(SEPARATOR).map(|(first, _)| first.trim());
+            if first.is_some_and(|first| first.starts_with(|c: char| c.is_ascii_digit())) {
                 answer.jobs.push(parse_job(line)?);
             } else if !line.starts_with(CLUSTER_HEADING) {
                 answer.foreign.push(line.to_owned());
@@ -252,6 +254,10 @@ mod tests {
         let QueueAnswer { jobs, foreign } = QueueAnswer::parse(text).unwrap();
         assert_eq!((jobs.len(), jobs[0].index, foreign), (1, 3, vec!["Maintenance on Monday".to_owned()]));
         assert!(QueueAnswer::parse("CLUSTER: alpha\n").unwrap().jobs.is_empty());
+        let banner = "| Welcome | to the cluster |\nNote 7 | see the wiki\n17|3|RUNNING|None|n1|x\n";
+        let QueueAnswer { jobs, foreign } = QueueAnswer::parse(banner).unwrap();
+        assert_eq!((jobs.len(), foreign.len()), (1, 2));
+        assert!(QueueAnswer::parse("17|3|RUNNING\n").is_err() && QueueAnswer::parse("17_3|RUNNING|x\n").is_err());
     }
 
     #[test]
