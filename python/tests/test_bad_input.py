@@ -138,6 +138,8 @@ def test_unknown_names_are_key_errors_with_a_plain_sentence(server: str) -> None
     [
         ({"num_envs": 0}, "num_envs=0"),
         ({"num_envs": 2.5}, "num_envs=2.5"),
+        ({"num_envs": True}, "num_envs=True"),
+        ({"episodes_per_trial": 10**9 * 10}, "from 1 to 2\\^32 - 1"),
         ({"num_envs": 2**32}, "4294967296"),
         ({"autoreset_mode": "Sometimes"}, "'SameStep'"),
         ({"first_environment_index": "first"}, "'first'"),

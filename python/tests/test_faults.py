@@ -221,6 +221,41 @@ def test_idle_session_answers_keepalive_pings(start_server: Callable[..., Any]) 
     env.close()
 
 
+SEVERAL_MACHINES = """
+import os, sys
+import perturb
+statuses = []
+for _ in range(6):  # processes begin with different machines
+    child = os.fork()
+    if child == 0:
+        env = perturb.PerturbEnv("CartPole", server=sys.argv[1])
+        env.reset(seed=1)
+        env.close()
+        os._exit(0)
+    statuses.append(os.waitpid(child, 0)[1])
+print(statuses)
+"""
+
+
+def test_of_several_machines_one_that_accepts_is_taken(start_server: Callable[..., Any], tmp_path: Path) -> None:
+    draining = start_server(listen="tcp://127.0.0.1:0")
+    port = draining.address.rpartition(":")[2]
+    start_server(listen=f"tcp://127.0.0.2:{port}")
+    env = perturb.PerturbEnv("CartPole", server=draining.address)
+    env.reset()
+    draining.process.terminate()  # the session keeps it running
+    hosts = tmp_path / "hosts"
+    hosts.write_text("127.0.0.1 localhost machines.test\n127.0.0.2 machines.test\n")
+    script = 'mount --bind "$0" /etc/hosts && exec "$@"'
+    mounted = ["unshare", "--map-root-user", "--mount", "sh", "-c", script, str(hosts)]
+    if subprocess.run([*mounted, "true"], stderr=subprocess.DEVNULL, check=False).returncode != 0:
+        pytest.skip("this user may not mount files")
+    command = [*mounted, sys.executable, "-c", SEVERAL_MACHINES, f"machines.test:{port}"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ended.stdout == f"{[0] * 6}\n", ended.stderr
+    env.close()
+
+
 TENDING = """
 import perturb
 from perturb import session

@@ -82,8 +82,9 @@ def test_an_actor_refuses_what_it_cannot_see(copied: Path) -> None:
         actor(np.zeros((2, 4)), rewards=[0.0])
     with pytest.raises(perturb.PolicyError):
         actor(np.full((2, 4), np.nan))
-    with pytest.raises(perturb.InvalidArgumentError, match="num_envs=0"):
-        policy.actor(0)
+    for count in (0, True, 10**9):
+        with pytest.raises(perturb.InvalidArgumentError, match=f"num_envs={count}; .* to 1048576"):
+            policy.actor(count)
 
 
 def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,6 +104,8 @@ def test_sampled_contexts_are_prefixes_of_larger_samples() -> None:
         (lambda: perturb.sets.sampled("a", "CartPole", 3, version="D"), "'R' or 'E'"),
         (lambda: perturb.sets.sampled("a", "CartPole", 3, version="x"), "version='x'"),  # type: ignore[arg-type]
         (lambda: perturb.sets.sampled("a", "CartPole", 0), "count=0"),
+        (lambda: perturb.sets.sampled("a", "CartPole", 10**9), "from 1 to 16384"),
+        (lambda: perturb.sets.heatmap("CartPole", points=10**9), "from 2 to 100"),
         (lambda: perturb.sets.sampled("a", "CartPol", 3), "did you mean 'CartPole'"),
         (lambda: perturb.sets.read("/nowhere.toml"), "nowhere"),
     ],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,15 @@ def test_long_temporary_folder_is_named(tmp_path: Path, monkeypatch: pytest.Monk
     ) as caught:
         perturb.PerturbEnv("CartPole").reset()
     assert "server=" not in str(caught.value)
+    assert list(folder.iterdir()) == []
+
+
+def test_temporary_folder_that_is_no_text_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / os.fsdecode(b"latin\xfc")
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    with pytest.raises(perturb.ServerStartError, match="is not UTF-8; set TMPDIR to another folder"):
+        perturb.PerturbEnv("CartPole").reset()
     assert list(folder.iterdir()) == []
 
 

@@ -59,4 +59,7 @@ mod _native {
     /// Maximum number of points along each axis of a heatmap.
     #[pymodule_export]
     const MAX_HEATMAP_POINTS: usize = perturb_records::MAX_POINTS;
+    /// Maximum number of contexts in a set.
+    #[pymodule_export]
+    const MAX_CONTEXTS: usize = perturb_settings::sets::MAX_CONTEXTS;
 }

@@ -173,6 +173,7 @@ def read_sets(path: str) -> list[Set]:
     """Read the test sets of an experiment file."""
 
 HEATMAP_SET: str
+MAX_CONTEXTS: int
 MAX_HEATMAP_POINTS: int
 
 def heatmap_contexts(

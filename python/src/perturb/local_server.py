@@ -78,6 +78,14 @@ class TaskFolder:
     files: str
 
 
+def _is_utf8(path: str) -> bool:
+    try:
+        path.encode()
+    except UnicodeEncodeError:  # Python's stand-ins for bytes that are not UTF-8
+        return False
+    return True
+
+
 class LocalServer:
     """A running private server. It ends when this object is deleted, or when this process ends."""
 
@@ -94,6 +102,12 @@ class LocalServer:
                 "set TMPDIR to a folder that can be written"
             ) from error
         socket = f"{directory}/server.sock"
+        if not _is_utf8(socket):
+            shutil.rmtree(directory, ignore_errors=True)
+            raise ServerStartError(
+                f"the private server {program} did not start: the path of its socket, {socket!r}, is not UTF-8; set "
+                "TMPDIR to another folder, such as /tmp"
+            )
         if len(socket.encode()) > MAX_SOCKET_PATH_BYTES:
             shutil.rmtree(directory, ignore_errors=True)
             raise ServerStartError(

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
+# Maximum number of environments of an actor, whose memory is allocated at once.
+MAX_ENVIRONMENTS = 1 << 20
+
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Load a policy that `perturb train` wrote, from the `--out` folder of the training or its checkpoint folder.
@@ -76,11 +79,11 @@ class Policy:
         """Return an actor that chooses actions in N environments.
 
         Args:
-            num_envs: the number N of environments.
+            num_envs: the number N of environments, at most 2^20.
             seed: fixes the sampled actions, together with the environment's index and the trial's index.
             first_environment_index: the index of the first environment.
         """
-        count = requests.count(num_envs, "num_envs", 1)
+        count = requests.count(num_envs, "num_envs", 1, MAX_ENVIRONMENTS)
         first = requests.count(first_environment_index, "first_environment_index", 0)
         if first + count > 2**32:
             raise InvalidArgumentError(

@@ -269,26 +269,21 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
     return values
 
 
-def count(value: Any, name: str, least: int) -> int:
-    """Check an integer from `least` to 2^32 - 1, and return it as an int."""
+def count(value: Any, name: str, least: int, most: int = 2**32 - 1) -> int:
+    """Check an integer from `least` to `most`, and return it as an int."""
     try:
-        number = operator.index(value)
+        number = -1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = -1
-    if not least <= number < 2**32:
-        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {least} to 2^32 - 1")
+    if not least <= number <= most:
+        limit = "2^32 - 1" if most == 2**32 - 1 else most
+        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {least} to {limit}")
     return number
 
 
 def pixels(value: Any, name: str) -> int:
     """Check the width or height of a picture, in pixels, and return it as an int."""
-    try:
-        number = operator.index(value)
-    except TypeError:
-        number = 0
-    if not MIN_PIXELS <= number <= MAX_PIXELS:
-        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {MIN_PIXELS} to {MAX_PIXELS}")
-    return number
+    return count(value, name, MIN_PIXELS, MAX_PIXELS)
 
 
 def render_mode(value: Any) -> None:

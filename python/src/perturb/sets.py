@@ -117,13 +117,14 @@ def sampled(
     Args:
         name: the set's name, of letters, digits and _.
         environment: the environment's name.
-        count: the number of contexts.
+        count: the number of contexts, 1 … 16 384.
         version: the version to draw from, `R` or `E`.
         seed: fixes the contexts, 0 … 2^64 - 1.
         task: the folder of the environment's task, if it is a task from a folder.
 
     Raises:
-        InvalidArgumentError: if the environment is unknown, the version is neither R nor E, or the count is below 1.
+        InvalidArgumentError: if the environment is unknown, the version is neither R nor E, or the count is out of its
+            range.
     """
     parameters = _environment(environment, task).parameters
     version = requests.version(version)
@@ -131,7 +132,7 @@ def sampled(
         raise InvalidArgumentError(f"version={version!r}; expected 'R' or 'E', which contexts are drawn from")
     generator = np.random.Generator(np.random.PCG64(requests.seed(seed)))
     contexts: list[dict[str, float]] = []
-    for _ in range(requests.count(count, "count", 1)):
+    for _ in range(requests.count(count, "count", 1, _native.MAX_CONTEXTS)):
         context = {}
         for parameter in parameters.values():
             intervals = parameter.random if version == "R" else parameter.extreme
@@ -190,8 +191,7 @@ def heatmap(
     wrong = [name for name in axes if name in (fixed or {})]
     if axes[0] == axes[1] or wrong:
         raise InvalidArgumentError(f"{wrong[0] if wrong else axes[0]} is an axis, and cannot be something else, too")
-    if requests.count(points, "points", 2) > _native.MAX_HEATMAP_POINTS:
-        raise InvalidArgumentError(f"points is {points}; expected 2 … {_native.MAX_HEATMAP_POINTS}")
+    points = requests.count(points, "points", 2, _native.MAX_HEATMAP_POINTS)
     contexts = native(_native.heatmap_contexts, ranges, points, dict(fixed or {}))
     return listed(_native.HEATMAP_SET, contexts, base=base)
 
