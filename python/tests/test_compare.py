@@ -12,14 +12,15 @@ import pytest
 
 import perturb
 
+from .conftest import ROOT
 from .test_assess import run, upright
 from .test_policy import CART_POLE, POLICIES
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# The 97.5 % quantiles of Student's t with 2 and with 59 degrees of freedom (from tables, to 6 digits).
-T_2, T_59 = 4.302653, 2.000995
+# The 97.5 % quantiles of Student's t with 2, 4 and 59 degrees of freedom (from tables, to 6 digits).
+T_2, T_4, T_59 = 4.302653, 2.776445, 2.000995
 
 
 def noisy(share: float, seed: int) -> Callable[[Any], Any]:
@@ -142,6 +143,63 @@ def test_saved_assessments_are_compared_as_they_are(
     assert mixed.mean("plain", "E").by_seed == comparison.mean("plain", "E").by_seed[:1]
     output = run("compare", str(tmp_path / "plain"), str(tmp_path / "careful"))
     assert comparison.verdict in output, "the program says the same"
+
+
+def test_rows_of_a_results_table_are_compared_by_their_counts() -> None:
+    pd = pytest.importorskip("pandas")
+    results = perturb.read_results(ROOT / "results/results.parquet")
+    rows = results[(results.study == "classic-ff") & (results.environment == "CartPole") & (results.seed > 1)]
+    rows = rows[(rows.trained_on == "R") & rows.algorithm.isin(["a2c", "ppo"]) & (rows.run <= 5)]
+    final = rows[rows.tested_on.isin(["D", "R", "E"])]
+    assert set(final.groupby(["algorithm", "tested_on"]).seed.nunique()) == {5}
+    compared = perturb.compare(dict(list(rows.groupby("algorithm"))), baseline="a2c")
+    assert (compared.environment, compared.success, compared.evaluations) == ("CartPole", None, {})
+    z = 1.959963984540054
+    for tested_on in ("D", "R", "E"):
+        frame = final[final.tested_on == tested_on]
+        by_seed = frame.pivot_table(index="seed", columns="algorithm", values="success_percent")
+        for algorithm in ("a2c", "ppo"):
+            it, seeds = compared.mean(algorithm, tested_on), by_seed[algorithm]
+            assert it.by_seed == pytest.approx(seeds.tolist(), rel=1e-12)
+            half = T_4 * seeds.sem()
+            assert it.seeds_interval == pytest.approx((seeds.mean() - half, seeds.mean() + half), rel=1e-5)
+            assert (it.seeds, it.episodes) == (5, 1000)
+            own = frame[frame.algorithm == algorithm]
+            shares = (own.successes / own.episodes).astype(float)
+            p, variance = shares.mean(), (shares * (1 - shares) / own.episodes.astype(float)).sum() / 25
+            n = p * (1 - p) / variance if variance else 5000
+            middle = (p + z**2 / (2 * n)) / (1 + z**2 / n)
+            half = z / (1 + z**2 / n) * math.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+            assert it.episodes_interval == pytest.approx((100 * (middle - half), 100 * (middle + half)), rel=1e-9)
+        pairs = by_seed["ppo"] - by_seed["a2c"]
+        (difference,) = [it for it in compared.differences if it.tested_on == tested_on]
+        assert (difference.paired, difference.same_episodes) == (True, False)
+        assert difference.by_seed == pytest.approx(pairs.tolist(), rel=1e-12)
+        half = T_4 * pairs.sem()
+        assert difference.seeds_interval == pytest.approx((pairs.mean() - half, pairs.mean() + half), rel=1e-5)
+    assert "as if all policies had played different episodes" in str(compared)
+    output = run(
+        *("compare", str(ROOT / "results/results.parquet/classic-ff"), "--by", "algorithm", "--baseline", "a2c"),
+        *("--where", "environment=cart-pole", "trained_on=R", "algorithm=a2c,ppo", "seed=2..6"),
+    )
+    assert f"{compared.verdict}." in output, "the program says the same"
+    by_return = perturb.compare({"all": rows[rows.algorithm == "ppo"]}, versions=["E"], score="return")
+    assert by_return.means[0].mean == pytest.approx(
+        final[(final.algorithm == "ppo") & (final.tested_on == "E")].mean_return.mean(), rel=1e-12
+    )
+    assert by_return.means[0].episodes_interval is None
+    with pytest.raises(perturb.InvalidArgumentError, match="have no episodes"):
+        compared.columns()
+    for conditions, words in [
+        ({"a": results[results.study == "classic-ff"]}, "one environment; choose its rows"),
+        ({"a": rows}, "several policies of seed 2, which differ by .*algorithm"),
+        ({"a": rows, "b": upright}, "expected rows for all or for none"),
+        ({"a": pd.DataFrame({"study": ["s"]})}, "have no column cell"),
+    ]:
+        with pytest.raises(perturb.InvalidArgumentError, match=words):
+            perturb.compare(conditions)
+    with pytest.raises(perturb.InvalidArgumentError, match="are not tested again"):
+        perturb.compare({"a": rows}, episodes=5)
 
 
 def test_few_and_unequal_seeds_are_compared_as_such(server: str) -> None:

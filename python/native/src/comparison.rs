@@ -1,6 +1,8 @@
 //! The comparison of conditions for Python. It returns the numbers and sentences of `perturb compare`.
 
-use perturb_records::comparison::{self, ComparedCondition, ComparedScore};
+use perturb_records::TableRow;
+use perturb_records::comparison::{self, ComparedCondition, ComparedScore, ConditionComparison, TableCondition};
+use perturb_settings::ValueError;
 use pyo3::prelude::*;
 
 use crate::failure::{INVALID, failure};
@@ -19,11 +21,71 @@ pub fn compare(
     score: &str,
     baseline: Option<&str>,
 ) -> PyResult<String> {
+    let conditions: Vec<_> = conditions.iter().map(by_reference).collect();
+    as_json(score, |score| comparison::compare(&conditions, &sets, score, baseline))
+}
+
+/// The values of a row of a results table that a comparison needs. A missing value is None.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct ComparedRow {
+    study: String,
+    cell: String,
+    environment: String,
+    revision: Option<u64>,
+    model_hash: Option<String>,
+    trained_on: String,
+    tested_on: Option<String>,
+    seed: u64,
+    episodes: Option<u64>,
+    successes: Option<u64>,
+    mean_return: Option<f64>,
+    mean_length: Option<f64>,
+    settings: String,
+}
+
+/// Compares conditions of rows of a results table, in the tests on the given sets or on all that they have in common.
+/// Returns JSON.
+#[pyfunction]
+#[pyo3(signature = (conditions, sets, score, baseline))]
+pub fn compare_rows(
+    conditions: Vec<(String, Vec<ComparedRow>)>,
+    sets: Option<Vec<String>>,
+    score: &str,
+    baseline: Option<&str>,
+) -> PyResult<String> {
+    let row = |row: ComparedRow| TableRow {
+        study: row.study,
+        cell: row.cell,
+        environment: row.environment,
+        revision: row.revision,
+        model_hash: row.model_hash,
+        trained_on: row.trained_on,
+        tested_on: row.tested_on,
+        seed: row.seed,
+        episodes: row.episodes,
+        successes: row.successes,
+        mean_return: row.mean_return,
+        mean_length: row.mean_length,
+        settings: row.settings,
+        ..TableRow::default()
+    };
+    let named = |(name, rows): (String, Vec<ComparedRow>)| (name, rows.into_iter().map(row).collect());
+    let conditions: Vec<(String, Vec<TableRow>)> = conditions.into_iter().map(named).collect();
+    let conditions: Vec<_> = conditions
+        .iter()
+        .map(|(name, rows)| TableCondition { name: name.clone(), rows: rows.iter().collect() })
+        .collect();
+    as_json(score, |score| comparison::compare_rows(&conditions, sets.as_deref(), score, baseline))
+}
+
+fn as_json(
+    score: &str,
+    compare: impl FnOnce(ComparedScore) -> Result<ConditionComparison, ValueError>,
+) -> PyResult<String> {
     let invalid = |error: String| failure(INVALID, 0, error);
     let score: ComparedScore = serde_json::from_value(score.into()).map_err(|error| invalid(error.to_string()))?;
-    let conditions: Vec<_> = conditions.iter().map(by_reference).collect();
-    let compared =
-        comparison::compare(&conditions, &sets, score, baseline).map_err(|error| invalid(error.to_string()))?;
+    let compared = compare(score).map_err(|error| invalid(error.to_string()))?;
     serde_json::to_string(&compared).map_err(|error| invalid(error.to_string()))
 }
 

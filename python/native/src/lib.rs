@@ -36,7 +36,7 @@ mod _native {
     #[pymodule_export]
     use super::assessed::{Assessment, report_page};
     #[pymodule_export]
-    use super::comparison::compare;
+    use super::comparison::{compare, compare_rows};
     #[pymodule_export]
     use super::embedded::NativeServer;
     #[pymodule_export]

@@ -157,6 +157,11 @@ def compare(
 ) -> str:
     """Compare conditions in the tests on these sets. Return JSON."""
 
+def compare_rows(
+    conditions: list[tuple[str, list[dict[str, Any]]]], sets: list[str] | None, score: str, baseline: str | None
+) -> str:
+    """Compare conditions of rows of a results table in the tests on these sets, or on all common ones, as JSON."""
+
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:
     """Return the report page of assessments, and of the folders `beside` with experiments and assessments, as HTML."""
 

@@ -30,6 +30,10 @@ _INTERVALS = (
     "five). With fewer than three seeds there are none. Those over episodes speak of these policies in other episodes. "
     "p is of t tests over seeds, corrected after Holm for all differences."
 )
+_COUNTS = (
+    "Rows of a results table have no episodes. Intervals of success rates over episodes are from the numbers of "
+    "successes, as if all policies had played different episodes; returns and lengths have no interval over episodes."
+)
 
 
 class Comparison:
@@ -40,11 +44,13 @@ class Comparison:
     Attributes:
         environment: the name of the environment.
         score: the compared score: `success`, `return` or `length`.
-        success: the success rule as a phrase. None if the server decided about success and stated no rule.
+        success: the success rule as a phrase. None if the server decided about success and stated no rule,
+            and for rows of a results table.
         means: the mean score of each condition in each test, ordered by test.
         differences: the difference of each compared pair of conditions in each test, ordered by test.
         verdict: a sentence with the conclusion from these numbers.
-        evaluations: the assessment of each policy, by condition and then by the policy's key.
+        evaluations: the assessment of each policy, by condition and then by the policy's key. Empty for rows of a
+            results table.
     """
 
     def __init__(
@@ -54,15 +60,15 @@ class Comparison:
         differences: Sequence[ConditionDifference],
         verdict: str,
         evaluations: Mapping[str, Mapping[str, Assessment]],
+        environment: str | None = None,
     ) -> None:
         self.score = score
         self.means = tuple(means)
         self.differences = tuple(differences)
         self.verdict = verdict
         self.evaluations = evaluations
-        first = self._assessments()[0]
-        self.environment = first.environment
-        self.success = first.success
+        self.environment = environment or self._assessments()[0].environment
+        self.success = self._assessments()[0].success if evaluations else None
 
     def mean(self, condition: str, tested_on: str) -> ConditionMean:
         """Return the mean score of a condition in a test.
@@ -123,7 +129,11 @@ class Comparison:
         """Return all recorded episodes of all policies as columns: arrays [episodes] by column name.
 
         The columns are `condition`, `key` (the policy's key in its condition) and those of `Assessment.columns`.
+
+        Raises:
+            InvalidArgumentError: for rows of a results table, which have no episodes.
         """
+        self._assessments()
         parts = [
             {"condition": condition, "key": key, **assessment.columns()}
             for condition, policies in self.evaluations.items()
@@ -185,7 +195,8 @@ class Comparison:
             "th,td{padding:.3em .8em;border-bottom:1px solid #ddd;text-align:right}"
             "th:first-child,td:first-child{text-align:left}"
         )
-        title = html.escape(f"{' and '.join(self.evaluations)} in {self.environment}")
+        conditions = dict.fromkeys(it.condition for it in self.means)
+        title = html.escape(f"{' and '.join(conditions)} in {self.environment}")
         page = (
             '<!doctype html><html lang="en"><head><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -256,11 +267,13 @@ class Comparison:
         return plots.heatmaps(panels, x, y, first.parameters, title, cbar, axes)
 
     def _assessments(self) -> list[Assessment]:
+        if not self.evaluations:
+            raise InvalidArgumentError("rows of a results table have no episodes; compare policies or assessments")
         return [one for policies in self.evaluations.values() for one in policies.values()]
 
     def __str__(self) -> str:
         tables = [self._means_table(), *([self._differences_table()] if self.differences else [])]
-        return "\n\n".join([self._title(), *map(text, tables), f"{self.verdict}.", _INTERVALS])
+        return "\n\n".join([self._title(), *map(text, tables), f"{self.verdict}.", self._note()])
 
     __repr__ = __str__
 
@@ -268,9 +281,14 @@ class Comparison:
         tables = [self._means_table(), *([self._differences_table()] if self.differences else [])]
         shown = "".join(f"<div>{as_html(table)}</div>" for table in tables)
         first = f"<p>{html.escape(self._title())}</p><p><b>{html.escape(self.verdict)}.</b></p>"
-        return f"{first}{shown}<p>{html.escape(_INTERVALS)}</p>"
+        return f"{first}{shown}<p>{html.escape(self._note())}</p>"
+
+    def _note(self) -> str:
+        return _INTERVALS if self.evaluations else f"{_INTERVALS} {_COUNTS}"
 
     def _title(self) -> str:
+        if not self.evaluations:
+            return f"{self.environment}, rows of a results table"
         return f"{self.environment}, a success is {self.success or 'what the server says'}"
 
     def _means_table(self) -> list[list[str]]:

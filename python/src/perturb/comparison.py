@@ -26,6 +26,22 @@ if TYPE_CHECKING:
 EPISODES, SEED = 1000, 1
 # The file by which the folder of an assessment is recognised.
 _ASSESSMENT = "assessment.json"
+# What a comparison needs of each row of a results table.
+_COLUMNS = (
+    "study",
+    "cell",
+    "environment",
+    "revision",
+    "model_hash",
+    "trained_on",
+    "tested_on",
+    "seed",
+    "episodes",
+    "successes",
+    "mean_return",
+    "mean_length",
+    "settings",
+)
 
 Score = Literal["success", "return", "length"]
 
@@ -67,9 +83,12 @@ def compare(
         conditions: the policies of each condition, by a name of your choice: one policy, a list, or a mapping by keys
             such as training seeds. The key of a policy in a list is its seed if all are policies of `load_policy` with
             distinct seeds, and else its position. A policy is one that `evaluate` accepts, an `Assessment`, or the
-            path of a saved assessment or of a checkpoint.
-        environment: as in `evaluate`. Leave it out if all policies are assessments.
-        versions: as in `evaluate`. For assessments, the tests to compare: by default all that they have in common.
+            path of a saved assessment or of a checkpoint. Or each condition has rows of `read_results`, such as
+            `dict(list(rows.groupby("algorithm")))`. Rows have no episodes: only success has an interval over episodes,
+            from its counts.
+        environment: as in `evaluate`. Leave it out if all policies are assessments or rows.
+        versions: as in `evaluate`. For assessments and rows, the tests to compare: by default all that
+            they have in common. Sets of rows are given by their names.
         episodes: as in `evaluate`. By default the number of the first assessment, or 1000 without assessments.
         seed: seed of all tests. By default the seed of the first assessment, or 1 without assessments.
         parameters: as in `evaluate`.
@@ -95,6 +114,18 @@ def compare(
         ServerTimeoutError: as in `evaluate`.
         ServerStartError: as in `evaluate`.
     """
+    if rows := _rows(conditions):
+        of_tests = (environment, episodes, seed, parameters, contexts, success, observe, deterministic, normalizer)
+        if task is not None or any(option is not None for option in of_tests):
+            raise InvalidArgumentError(
+                "rows of a results table are not tested again; expected versions, score and baseline alone"
+            )
+        names = None if versions is None else [it.name if isinstance(it, Set) else it for it in versions]
+        return _comparison(
+            native(_native.compare_rows, rows, names, score, baseline),
+            score,
+            environment=next(row["environment"] for _, own in rows for row in own),
+        )
     given = _conditions(conditions)
     saved = [one for policies in given.values() for one in policies.values() if isinstance(one, Assessment)]
     if environment is None:
@@ -142,8 +173,17 @@ def _compared(
         (name, [(key, one._assessed[0].records) for key, one in policies.items()])
         for name, policies in evaluations.items()
     ]
+    return _comparison(native(_native.compare, plain, list(tests), score, baseline), score, evaluations)
+
+
+def _comparison(
+    compared: str,
+    score: Score,
+    evaluations: Mapping[str, Mapping[str, Assessment]] | None = None,
+    environment: str | None = None,
+) -> Comparison:
     # The native module computes all numbers, and returns them as JSON.
-    found: Mapping[str, Any] = json.loads(native(_native.compare, plain, list(tests), score, baseline))
+    found: Mapping[str, Any] = json.loads(compared)
     means = tuple(
         ConditionMean(
             it["condition"],
@@ -175,7 +215,28 @@ def _compared(
         )
         for it in found["differences"]
     )
-    return Comparison(score, means, differences, found["verdict"], evaluations)
+    return Comparison(score, means, differences, found["verdict"], evaluations or {}, environment)
+
+
+def _rows(conditions: Any) -> list[tuple[str, list[dict[str, Any]]]] | None:
+    """Return the rows of a results table for each condition, or None if no condition is a DataFrame."""
+    if not isinstance(conditions, Mapping) or not any(hasattr(frame, "groupby") for frame in conditions.values()):
+        return None
+    found = []
+    for name, frame in conditions.items():
+        if not hasattr(frame, "groupby"):
+            raise InvalidArgumentError(
+                f"the condition {name!r} is not of rows of `read_results`; expected rows for all or for none"
+            )
+        missing = [column for column in _COLUMNS if column not in frame.columns]
+        if missing:
+            raise InvalidArgumentError(
+                f"the rows of {name!r} have no column {missing[0]}; expected all columns of `read_results`"
+            )
+        records = frame[list(_COLUMNS)].astype(object)
+        rows = records.where(records.notna(), None).to_dict("records")
+        found.append((" ".join(map(str, name)) if isinstance(name, tuple) else str(name), rows))
+    return found
 
 
 def _interval(ends: Sequence[float] | None) -> tuple[float, float] | None:
