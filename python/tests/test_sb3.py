@@ -145,7 +145,7 @@ def test_attributes_and_methods_are_those_of_each_environment(server: str) -> No
 def test_settings_that_would_break_it_are_refused(server: str) -> None:
     for settings in ({"autoreset_mode": "NextStep"}, {"copy": False}):
         given: dict[str, Any] = {**settings, "server": server}
-        with pytest.raises(perturb.InvalidArgumentError, match=f"{next(iter(settings))}= is what"):
+        with pytest.raises(perturb.InvalidArgumentError, match=f"{next(iter(settings))}= is fixed"):
             make_vec_env("CartPole", **given)
     with pytest.raises(perturb.InvalidArgumentError, match="'x' is none of"):
         make_vec_env("CartPole", server=server, version="x")
