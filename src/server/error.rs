@@ -54,7 +54,7 @@ impl Default for ErrorCounters {
 }
 
 impl ErrorCounters {
-    /// Adds one error of this class.
+    /// Counts one error of the class `kind`.
     pub fn count(&self, kind: ErrorKind) {
         self.0[kind as usize].fetch_add(1, Ordering::Relaxed);
     }

@@ -40,7 +40,7 @@ pub struct Token {
     revoked: AtomicBool,
     /// Wakes the tasks that wait in [`Token::revoked`].
     revoked_notify: Notify,
-    /// Shared by all tokens that have had this name.
+    /// The quotas of the token's name. A token that replaces another one of the same name shares them.
     quotas: Arc<Quotas>,
 }
 

@@ -19,11 +19,11 @@ fn refused(mut command: Command) -> String {
 }
 
 #[rstest]
-#[case::nothing(&["--listen", "tcp://0.0.0.0:0"], "neither encrypt nor ask")]
-#[case::ipv6(&["--listen", "tcp://[::]:0"], "neither encrypt nor ask")]
+#[case::nothing(&["--listen", "tcp://0.0.0.0:0"], "neither encrypt connections nor")]
+#[case::ipv6(&["--listen", "tcp://[::]:0"], "neither encrypt connections nor")]
 #[case::second(&["--listen", "tcp://127.0.0.1:0", "--listen", "tcp://0.0.0.0:0"], "tcp://0.0.0.0:0 can be reached")]
 #[case::tokens(&["--listen", "tcp://0.0.0.0:0", "--tokens", "x"], "unencrypted")]
-#[case::tls(&["--listen", "tcp://0.0.0.0:0", "--tls-cert", "x", "--tls-key", "x"], "not ask who they are")]
+#[case::tls(&["--listen", "tcp://0.0.0.0:0", "--tls-cert", "x", "--tls-key", "x"], "not authenticate them")]
 fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[case] part: &str) {
     let mut command = command();
     command.args(flags);
