@@ -10,10 +10,13 @@
 //! ```
 //! use perturb_mujoco::{Kind, Model, Simulation};
 //!
-//! let model = Model::from_xml("<mujoco><worldbody><body name='ball'><freejoint/><geom
-//! size='.1'/></body></worldbody></mujoco>")?; let ball = model.id(Kind::Body, "ball")?; let mut simulation =
-//! Simulation::new(model)?; simulation.step1()?; simulation.step2()?; simulation.step1()?; // computes the poses of the
-//! new state assert!(simulation.xipos(ball)[2] < 0.0);
+//! let model = Model::from_xml("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")?;
+//! let ball = model.id(Kind::Body, "ball")?;
+//! let mut simulation = Simulation::new(model)?;
+//! simulation.step1()?;
+//! simulation.step2()?;
+//! simulation.step1()?; // poses are those of the new state
+//! assert!(simulation.xipos(ball)[2] < 0.0);
 //! # Ok::<(), perturb_mujoco::Error>(())
 //! ```
 //!
