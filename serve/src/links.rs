@@ -31,7 +31,7 @@ impl WayUp {
         }
     }
 
-    /// Makes the absolute links in the HTML of a page, or of a part of a page, relative.
+    /// Returns the HTML of a page or of a part of a page, with relative links instead of absolute ones.
     pub(crate) fn relative_links(&self, html: &str) -> String {
         ATTRIBUTES.iter().fold(html.to_owned(), |html, attribute| {
             html.replace(&format!("{attribute}/"), &format!("{attribute}{}", self.0))

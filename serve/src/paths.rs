@@ -1,4 +1,5 @@
-//! Paths below the served folder in addresses of pages, and the kinds of files that are sent.
+//! The paths of files and folders below the served folder, as pages' addresses contain them. Also lists the kinds of
+//! files that the server sends.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::{OsStrExt, OsStringExt};

@@ -84,8 +84,8 @@ impl ReportCache {
         }
     }
 
-    /// Returns the fingerprint of the report that a request would get now. `fingerprint` is that of the present files.
-    /// The result is an earlier fingerprint if the cached report is too recent to be built again.
+    /// Returns the fingerprint of the report that a request would get now. `fingerprint` is the fingerprint of the
+    /// present files. The result is an earlier fingerprint if the cached report is too recent to be built again.
     pub(crate) fn fingerprint(&self, folder: &Path, fingerprint: u64) -> u64 {
         let reports = self.reports();
         reports
@@ -94,8 +94,8 @@ impl ReportCache {
             .map_or(fingerprint, |report| report.fingerprint)
     }
 
-    /// Returns the report of the experiment or assessment in `folder` as HTML. Builds it if there is no usable one in the cache.
-    /// `fingerprint` is that of the present files.
+    /// Returns the report of the experiment or assessment in `folder` as HTML. Builds the report if the cache has no
+    /// usable one. `fingerprint` is the fingerprint of the present files.
     ///
     /// # Errors
     /// A text with the reason why there is no report.

@@ -106,7 +106,7 @@ fn split(text: &str) -> (Option<&str>, Vec<PathBuf>) {
     (name, paths.split(',').map(PathBuf::from).collect())
 }
 
-/// Returns the name of a condition that was given none: that of its first path.
+/// Returns the name of a condition to which the user gave no name. It is the name of the condition's first path.
 fn default_name(paths: &[PathBuf]) -> String {
     paths[0].file_stem().unwrap_or(paths[0].as_os_str()).to_string_lossy().into_owned()
 }

@@ -151,7 +151,8 @@ impl Encode for SheetEncoder {
 mod tests {
     use super::*;
 
-    /// Returns the first byte of each picture in each row, on a sheet of frames of 2 × 1 pixels.
+    /// Draws a sheet of episodes with these numbers of steps, and reads it back. Each picture and each gap is 2 pixels
+    /// wide. Returns the first byte of every picture and gap, for each row of pixels.
     fn sheet(grid: EpisodeGrid, lengths: &[usize]) -> Vec<Vec<u8>> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("a.png");

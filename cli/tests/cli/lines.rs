@@ -16,7 +16,8 @@ const FAULTY: usize = 4;
 /// The minimum number of bytes before the fault of the first connection. The reply to its first request, the catalogue,
 /// has 21 kB. If the first requests failed, the client would end at once instead of reconnecting.
 const BEGUN: usize = 64_000;
-/// Maximum number of bytes before a fault. A training's connection carries more bytes in both directions.
+/// Upper bound of the random position of a fault, in bytes. The connection of an uninterrupted training carries more
+/// bytes than this in each direction, so the faults can occur.
 const MOST: u64 = 200_000;
 
 /// Trains a policy with the server at `address`.

@@ -1,4 +1,4 @@
-//! Folders whose names are no text, and links to runs.
+//! Folders whose names are not UTF-8 or contain a line break, and links to runs.
 
 use std::ffi::OsStr;
 use std::os::unix::ffi::OsStrExt;

@@ -230,8 +230,9 @@ fn disturbed_episodes_are_recorded_and_replayed() {
     assert!(stderr(&refused).contains(expected), "{}", stderr(&refused));
 }
 
-/// In Pendulum, the rule of the paper's text counts the last steps near upright. The rule of its code counts the
-/// longest time near upright.
+/// Pendulum has two success rules. The rule in the paper's text counts the successive steps near upright at the end of
+/// an episode. The rule in the paper's published code counts the most successive steps near upright anywhere in an
+/// episode. The choice of the rule must not change the episodes of a test.
 #[test]
 fn rules_with_different_quantities_test_equal_episodes() {
     let directory = tempfile::tempdir().expect("a directory");

@@ -72,7 +72,8 @@ pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Opt
     Ok(Some((EnvironmentComparison { environment, comparison }, success)))
 }
 
-/// Returns the table that `path` names. Recorded episodes are Parquet files, too, and no results tables.
+/// Returns the results table that `path` names. Returns `None` for any other path, also for a Parquet file of recorded
+/// episodes.
 fn table_at(path: &Path) -> Result<Option<StudyTable>> {
     match ResultsTable::find(path) {
         Ok(found) => Ok(found.map(|(_, table, study)| (table, Some(study).filter(|study| !study.is_empty())))),
@@ -81,7 +82,7 @@ fn table_at(path: &Path) -> Result<Option<StudyTable>> {
     }
 }
 
-/// Refuses options that do not go with the paths.
+/// Refuses a mixture of results tables and other paths, and options that do not apply to the kind of the given paths.
 fn check_options(args: &CompareArgs, has_tables: bool, has_others: bool) -> Result<()> {
     let refused = |message: &str| Err(CommandError::Usage(message.into()));
     if has_tables && has_others {
