@@ -25,6 +25,24 @@ fn a_run_whose_path_is_no_text_is_trained_and_listed() {
     let paths: Vec<&str> = listed.as_array().expect("a list").iter().filter_map(|run| run["path"].as_str()).collect();
     let ends = |end: &str| paths.iter().any(|path| path.ends_with(end));
     assert!(paths.len() == 2 && ends("/latin\u{fffd}") && ends("/new\nline"), "{paths:?}");
+    let output = perturb(&["ls"]).arg(folder.path()).output().expect("perturb runs");
+    let table = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(table.lines().any(|line| line.contains("new\\nline") && line.contains("CartPole")), "{table}");
     let output = perturb(&["ls"]).arg(folder.path().join("link")).output().expect("perturb runs");
     assert!(String::from_utf8_lossy(&output.stdout).contains("CartPole"), "{}", stderr(&output));
+}
+
+#[test]
+fn a_temporary_folder_that_is_no_text_is_named() {
+    let folder = tempfile::tempdir().expect("a directory");
+    let temporary = folder.path().join(OsStr::from_bytes(b"latin\xfc"));
+    std::fs::create_dir(&temporary).expect("a folder");
+    let mut command = perturb(&["train", "--env", "CartPole", "--episodes", "6", "--out"]);
+    let output = command.arg(folder.path().join("run")).env("TMPDIR", &temporary).output().expect("perturb runs");
+    assert!(!output.status.success());
+    let said = stderr(&output);
+    assert!(
+        said.contains("is not UTF-8") && said.contains("set TMPDIR to a folder") && !said.contains("--listen"),
+        "{said}"
+    );
 }

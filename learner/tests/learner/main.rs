@@ -10,4 +10,5 @@ mod losses;
 mod presets;
 mod recurrent;
 mod rl2;
+mod snapshots;
 mod together;

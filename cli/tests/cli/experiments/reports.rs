@@ -371,4 +371,14 @@ fn curves_of_two_learners_are_drawn_and_written() {
     let table = std::fs::read_to_string(report.join("curves.csv")).expect("a table");
     let lines_of = |name: &str| table.lines().filter(|line| line.contains(name)).count();
     assert!(lines_of("a2c") >= 2 && lines_of("a2c") == lines_of("ppo"), "{table}");
+    // As in somebody else's experiment: not even root can write here.
+    std::fs::remove_dir_all(&report).expect("removed");
+    std::os::unix::fs::symlink("/proc", &report).expect("a link");
+    for name in ["report", "curves"] {
+        let look = |more: &[&str]| perturb(&[name]).arg(experiment.out("out")).args(more).output().expect("ended");
+        let refused = look(&[]);
+        assert_eq!(refused.status.code(), Some(2), "{name}: {}", stderr(&refused));
+        assert!(stderr(&refused).contains("give another folder with --out"), "{name}: {}", stderr(&refused));
+        succeeded(&look(&["--out", experiment.out("own").to_str().expect("a path")]));
+    }
 }
