@@ -82,7 +82,7 @@ fn context(name: &str, line: u64, header: &[String], values: &StringRecord) -> R
 
 /// Splits a line into its fields, which may be in quotation marks.
 fn fields(what: &str, line: &str) -> Result<StringRecord, ValueError> {
-    let is_complete = line.matches('"').count() % 2 == 0;
+    let is_complete = line.matches('"').count().is_multiple_of(2);
     let got = format!("`{}`, with a quoted value that does not end", quoted(line));
     require(is_complete, what, got, "values within their line")?;
     let mut fields = StringRecord::new();
