@@ -15,13 +15,17 @@ pub fn snapshot_parts(lengths: impl IntoIterator<Item = usize>) -> Vec<Range<usi
 }
 
 fn parts(lengths: impl IntoIterator<Item = usize>, limit: usize) -> Vec<Range<usize>> {
-    let (mut parts, mut part, mut bytes) = (Vec::new(), 0..0, 0_usize);
+    let mut parts = Vec::new();
+    let mut part = 0..0;
+    let mut bytes = 0_usize;
     for (i, length) in lengths.into_iter().enumerate() {
         if bytes.saturating_add(length) > limit && !part.is_empty() {
             parts.push(part);
-            (part, bytes) = (i..i, 0);
+            part = i..i;
+            bytes = 0;
         }
-        (part.end, bytes) = (i + 1, bytes.saturating_add(length));
+        part.end = i + 1;
+        bytes = bytes.saturating_add(length);
     }
     parts.push(part);
     parts
@@ -31,18 +35,23 @@ fn parts(lengths: impl IntoIterator<Item = usize>, limit: usize) -> Vec<Range<us
 mod tests {
     use super::*;
 
+    /// Returns the only part of snapshots that fit in one message.
+    fn one(part: Range<usize>) -> Vec<Range<usize>> {
+        vec![part]
+    }
+
     #[test]
     fn parts_fit_in_a_message_and_keep_the_order() {
-        assert_eq!(parts([], 10), [0..0]);
+        assert_eq!(parts([], 10), one(0..0));
         assert_eq!(parts([4, 4, 2, 1], 10), [0..3, 3..4]);
-        assert_eq!(parts([0; 1000], 10), [0..1000], "servers that tell no length");
+        assert_eq!(parts([0; 1000], 10), one(0..1000), "servers that tell no length");
         assert_eq!(parts([5; 7], 10), [0..2, 2..4, 4..6, 6..7]);
         assert_eq!(parts([1, 11, usize::MAX, usize::MAX, 10], 10), [0..1, 1..2, 2..3, 3..4, 4..5], "too long ones");
     }
 
     #[test]
     fn snapshots_of_thousands_of_robots_are_one_part() {
-        assert_eq!(snapshot_parts([600; 16_384]), [0..16_384]);
+        assert_eq!(snapshot_parts([600; 16_384]), one(0..16_384));
         assert_eq!(snapshot_parts([384 << 10; 200]).len(), 3);
     }
 }

@@ -358,7 +358,8 @@ impl Session {
         let snapshots: Vec<Bytes> = snapshots.into_iter().map(Bytes::from).collect();
         let parts = snapshot_parts(snapshots.iter().map(Bytes::len));
         // The server refuses a wrong number of snapshots.
-        let parts = if snapshots.len() == self.selected(mask) { parts } else { vec![0..snapshots.len()] };
+        let all = 0..snapshots.len();
+        let parts = if snapshots.len() == self.selected(mask) { parts } else { vec![all] };
         for part in parts {
             let mask = self.part_mask(mask, &part, snapshots.len());
             let open = self.take(0)?;
