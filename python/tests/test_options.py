@@ -225,7 +225,8 @@ def test_long_snapshots_are_followed_by_the_same_bytes(
 ) -> None:
     envs = make_vec(name, num_envs=num_envs, parameters=parameters, server=server)
     envs.reset(seed=3)
-    actions = np.zeros((num_envs, *envs.single_action_space.shape), dtype=envs.single_action_space.dtype)
+    shape = envs.single_action_space.shape or ()
+    actions = np.zeros((num_envs, *shape), dtype=envs.single_action_space.dtype)
     observations = envs.step(actions)[0]
     saved = envs.snapshot()
     assert sum(map(len, saved)) > limit

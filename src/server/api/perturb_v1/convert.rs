@@ -1,4 +1,4 @@
-//! Checks the contents of requests, and converts between messages of the protocol and the types of [`env`] and the
+//! Checks the contents of requests, and converts between messages of the protocol and the types of [`crate::env`] and the
 //! pool.
 
 use super::Error;
