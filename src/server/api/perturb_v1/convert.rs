@@ -1,5 +1,5 @@
-//! Checks the contents of requests, and converts between messages of the protocol and the types of [`crate::env`] and the
-//! pool.
+//! Checks the contents of requests, and converts between messages of the protocol and the types of [`crate::env`] and
+//! the pool.
 
 use super::Error;
 use crate::{
