@@ -2,8 +2,9 @@
 
     code_links.py [--write] FILE...
 
-A link [`CODE`](PATH#L12) must point to a line that contains CODE. With --write the line numbers are corrected: the nearest
-line with CODE counts. To be called from the repository's root. Ends with 1 and a list of the links that show something else.
+A link [`CODE`](PATH#L12) must point to a line that contains CODE. --write corrects the numbers: each link then points
+to the nearest line that contains its CODE. Call this program from the repository's root. It ends with status 1 and a
+list of the links that show something else.
 """
 
 import os

@@ -1,9 +1,9 @@
-"""Checks the relative links of the repository's documents, by GitHub's rules, and of the built site. A link to a line of
-a source file must show the code that it names, see code_links.py.
+"""Checks the relative links of the repository's documents, by GitHub's rules, and of the built site.
 
     links.py SITE
 
-To be called from the repository's root. Ends with 1 and a list of the links that lead nowhere.
+A link to a line of a source file must show the code that it names, see code_links.py. Call this program from the
+repository's root. It ends with status 1 and a list of the links that lead nowhere.
 """
 
 import html.parser
