@@ -37,7 +37,7 @@ impl Ppo {
         Ok(Ppo { config, optimiser, rng: stream(seed, Purpose::Minibatches) })
     }
 
-    /// Returns the loss of the configured settings.
+    /// Returns the loss function to minimise: clipped PPO with the configured coefficients and ranges.
     fn objective(&self) -> Objective {
         let PpoConfig { clip_range, clip_range_vf, ent_coef, kl_coef, vf_coef, .. } = self.config;
         Objective {

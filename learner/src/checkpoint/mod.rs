@@ -41,8 +41,8 @@ pub struct History {
     pub recent: Vec<EpisodeFigures>,
     /// Seconds of training so far.
     pub elapsed: f64,
-    /// Seconds by activity. In format 1 of checkpoints, this and the entries of `recent` were JSON arrays without field
-    /// names, and are still read.
+    /// Seconds spent on each activity. Checkpoints of format 1 store this field and the entries of `recent` as JSON
+    /// arrays without field names. Such checkpoints can still be read.
     pub shares: TimeShares,
     /// The lengths of the log files, to which a resumed training cuts them.
     pub logs: LogLengths,

@@ -54,7 +54,8 @@ impl ServerShard {
         start..slots.end.clamp(start, self.range.end)
     }
 
-    /// Returns a mask, one byte per environment of this server, of those in `slots`; `None` if none is.
+    /// Returns a mask with one byte per environment of this server: 1 if its slot is in `slots`, else 0. Returns `None`
+    /// if this server has no environment in `slots`.
     pub(super) fn mask(&self, slots: &Range<usize>) -> Option<Bytes> {
         let own = self.overlap(slots);
         (!own.is_empty()).then(|| self.range.clone().map(|slot| u8::from(own.contains(&slot))).collect())

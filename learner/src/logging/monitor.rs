@@ -29,7 +29,7 @@ pub struct Monitor {
     /// Buffer of complete lines that have not been written yet.
     lines: csv::Writer<Vec<u8>>,
     clock: Clock,
-    /// Number of columns of applied values; 0 if an earlier program created the file without them.
+    /// Number of `applied_…` columns; 0 if an earlier version of the program created the file without these columns.
     applied: usize,
 }
 

@@ -33,8 +33,8 @@ impl CollectError {
 
 /// Fills rollouts with the steps of a player in N environments.
 ///
-/// A rollout has either T steps of each environment, or complete episodes. With T steps, episodes and a recurrent
-/// policy's memory continue from one rollout to the next.
+/// A rollout has either T steps of each environment, or complete episodes. If it has T steps, an unfinished episode
+/// continues in the next rollout, and a recurrent policy keeps its memory.
 ///
 /// For each rollout, call [`Collector::begin`], then alternate [`Collector::act`] and [`Collector::take`] until
 /// [`Collector::is_done`] returns true, then call [`Collector::finish`].

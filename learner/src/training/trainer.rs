@@ -31,7 +31,7 @@ pub(super) struct Trainer<'a> {
     /// The checkpoint after the last complete iteration. Its weights and normalisers are updated only when it is saved.
     pub(super) checkpoint: Checkpoint,
     pub(super) clock: Clock,
-    /// Seconds by activity, including earlier processes.
+    /// Seconds spent on each activity, including the time before the training was resumed.
     pub(super) shares: TimeShares,
     /// Duration of the last update; `None` before the first.
     pub(super) last_update: Option<Duration>,

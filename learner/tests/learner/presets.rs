@@ -1,5 +1,5 @@
-//! Tests how the presets differ in trainings and updates. docs/algorithms.md lists the differences, and tests of
-//! `perturb-settings` check the values.
+//! Tests the effects of the presets' settings on updates and on whole trainings. docs/algorithms.md lists the settings
+//! in which the presets differ. Tests of `perturb-settings` check the default values.
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
