@@ -370,18 +370,21 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
         std::mem::forget(closed);
     }
     Ok(async move {
-        tokio::select! {
-            _ = terminate.recv() => {}
-            _ = interrupt.recv() => {}
-            _ = user_1.recv(), if !exit_with_stdin => {}
-            _ = user_2.recv(), if !exit_with_stdin => {}
-            _ = processor_time.recv(), if !exit_with_stdin => {}
-            _ = stdin => {}
-        }
+        let is_warning = tokio::select! {
+            _ = terminate.recv() => false,
+            _ = interrupt.recv() => false,
+            _ = user_1.recv(), if !exit_with_stdin => true,
+            _ = user_2.recv(), if !exit_with_stdin => true,
+            _ = processor_time.recv(), if !exit_with_stdin => true,
+            _ = stdin => false,
+        };
         tokio::spawn(async move {
-            tokio::select! {
-                _ = terminate.recv() => {}
-                _ = interrupt.recv() => {}
+            // A batch system sends SIGTERM after its warning, and sessions keep their grace period then.
+            for _ in 0..=usize::from(is_warning) {
+                tokio::select! {
+                    _ = terminate.recv() => {}
+                    _ = interrupt.recv() => {}
+                }
             }
             std::process::exit(1);
         });

@@ -240,6 +240,19 @@ async fn private_server_ends_with_its_input_and_heeds_only_flags() {
     assert!(closed.elapsed() < Duration::from_secs(10), "a second's grace, although a session runs");
 }
 
+/// A batch system warns by a signal of its own choice before it sends SIGTERM.
+#[tokio::test]
+async fn sigterm_after_a_warning_keeps_the_grace_period() {
+    let mut server = Server::start(&["--grace-seconds", "60"]);
+    let (mut session, _) = Session::open(server.tcp(), open("CartPole", 1, 1)).await;
+    server.signal("USR1");
+    server.signal("TERM");
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    session.ask(perturb::proto::Reset::default()).await;
+    server.signal("TERM");
+    assert_eq!(server.ended().await.code(), Some(1), "a second SIGTERM ends it at once");
+}
+
 #[tokio::test]
 async fn the_catalogue_is_printed_as_a_server_would_tell_it() {
     let printed = command().arg("--catalogue").output().unwrap();

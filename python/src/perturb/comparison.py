@@ -36,6 +36,7 @@ _COLUMNS = (
     "trained_on",
     "tested_on",
     "seed",
+    "after_episodes",
     "episodes",
     "successes",
     "mean_return",

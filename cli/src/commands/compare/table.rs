@@ -5,7 +5,7 @@ use std::path::Path;
 
 use perturb_experiment::Plan;
 use perturb_records::comparison::{ComparedScore, TableCondition, compare_rows};
-use perturb_records::{ResultsTable, TableError, TableRow};
+use perturb_records::{ResultsTable, StudyPlan, TableError, TableRow};
 use perturb_report::EnvironmentComparison;
 
 use super::{Judged, default_name, split};
@@ -34,6 +34,7 @@ pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Opt
     }
     let is_only = conditions.len() == 1;
     let mut compared: Vec<TableCondition<'_>> = Vec::new();
+    let mut chosen: Vec<(&ResultsTable, &TableRow)> = Vec::new();
     for (name, is_named, tables) in &conditions {
         let mut groups: BTreeMap<String, usize> = BTreeMap::new();
         for (table, study) in tables {
@@ -43,6 +44,7 @@ pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Opt
                     group if is_only && !is_named => group.to_owned(),
                     group => format!("{name} {group}"),
                 };
+                chosen.extend(rows.iter().map(|&row| (table, row)));
                 let place = *groups.entry(group).or_insert(compared.len());
                 match compared.get_mut(place) {
                     Some(known) => known.rows.extend(rows),
@@ -64,7 +66,7 @@ pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Opt
     if failed > 0 {
         note(format!("{failed} failed cells are left out"));
     }
-    let success = success_rule(conditions.iter().flat_map(|(_, _, tables)| tables), rows().copied())?;
+    let success = success_rule(&chosen, !args.versions.is_empty())?;
     let environment = rows().next().map(|row| row.environment.clone()).unwrap_or_default();
     let sets: Vec<String> = args.versions.iter().map(ToString::to_string).collect();
     let sets = (!sets.is_empty()).then_some(&sets[..]);
@@ -100,22 +102,32 @@ fn check_options(args: &CompareArgs, has_tables: bool, has_others: bool) -> Resu
     Ok(())
 }
 
-/// Returns the rule of success of the studies of `rows`; `None` if it is the environment's own.
-fn success_rule<'a>(
-    tables: impl Iterator<Item = &'a StudyTable> + Clone,
-    rows: impl Iterator<Item = &'a TableRow>,
-) -> Result<Option<String>> {
-    let studies: BTreeSet<&str> = rows.map(|row| row.study.as_str()).collect();
+/// Returns the rule of success of the cells of `rows`; `None` if it is the environment's own. Each row stands beside its
+/// table, because two tables may have a study of the same name.
+fn success_rule(rows: &[(&ResultsTable, &TableRow)], names_sets: bool) -> Result<Option<String>> {
+    let mut plans: Vec<(&str, &StudyPlan, Plan)> = Vec::new();
     let mut rules = BTreeSet::new();
-    for study in &studies {
-        let plan = tables.clone().find_map(|(table, _)| table.studies.get(*study));
-        let plan = plan.map(|plan| Plan::of_study(study, plan)).transpose()?;
-        let cell = plan.iter().flat_map(|plan| plan.cells.iter().chain(&plan.candidates)).next();
+    for (table, row) in rows {
+        let Some(text) = table.studies.get(&row.study) else { continue };
+        let known = plans.iter().position(|(study, known, _)| *study == row.study && *known == text);
+        if known.is_none() {
+            plans.push((&row.study, text, Plan::of_study(&row.study, text)?));
+        }
+        let (.., plan) = &plans[known.unwrap_or(plans.len() - 1)];
+        let cell = plan.cells.iter().chain(&plan.candidates).find(|cell| cell.id == row.cell);
         rules.insert(cell.and_then(|cell| cell.tests.success.as_ref()).map(ToString::to_string));
     }
+    let studies: BTreeSet<&str> = plans.iter().map(|(study, ..)| *study).collect();
     if rules.len() > 1 {
         let studies = studies.into_iter().collect::<Vec<_>>().join(", ");
         return Err(CommandError::Usage(format!("the studies {studies} have different rules of success")));
+    }
+    if plans.len() > studies.len() && !names_sets {
+        return Err(CommandError::Usage(
+            "the tables have different plans of one study, whose sets may differ; name the versions to compare with \
+             --versions, such as --versions D,R,E"
+                .into(),
+        ));
     }
     Ok(rules.into_iter().next().flatten())
 }

@@ -207,11 +207,15 @@ impl TestedCondition<'_> {
         let by_seed = self.by_seed();
         let strata = self.strata();
         let mean = mean(by_seed.iter().copied());
+        let seeds_95 = mean_with_t_interval(std::slice::from_ref(&by_seed)).and_then(|it| it.interval_95);
         ConditionMean {
             condition: self.name.to_owned(),
             tested_on: set.to_owned(),
             mean,
-            seeds_95: mean_with_t_interval(std::slice::from_ref(&by_seed)).and_then(|it| it.interval_95),
+            seeds_95: seeds_95.map(|interval| match score {
+                ComparedScore::Success => interval.map(|end| end.clamp(0.0, 100.0)),
+                ComparedScore::Return | ComparedScore::Length => interval,
+            }),
             by_seed,
             episodes: self.policies.iter().map(|policy| policy.episodes).min().unwrap_or(0),
             episodes_95: strata.and_then(|strata| match score {

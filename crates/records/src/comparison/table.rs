@@ -68,10 +68,11 @@ fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
     for &row in &condition.rows {
         let Some(set) = row.tested_on.as_deref().filter(|set| *set != SELECTION_TEST) else { continue };
         let place = *places.entry((&row.study, &row.cell, set)).or_insert(found.len());
-        // Rows of later policies stand below those of earlier ones.
         match found.get_mut(place) {
-            Some(test) => *test = RowTest { set, row },
-            None => found.push(RowTest { set, row }),
+            Some(test) if row.after_episodes > test.row.after_episodes => *test = RowTest { set, row },
+            Some(test) if row.after_episodes < test.row.after_episodes => {}
+            // A second policy of this cell, as in another table, is refused later.
+            _ => found.push(RowTest { set, row }),
         }
     }
     found

@@ -104,6 +104,10 @@ fn success_rates_have_wilsons_interval_over_episodes() {
     let all = [policy(&[9; 4])];
     let [low, high] = compared(&all, &all, ComparedScore::Success).means[0].episodes_95.unwrap();
     assert!(low < 60.0 && high == 100.0, "{low}");
+    // An interval over seeds ends where success rates end.
+    let seeds = [policy(&[9; 4]), policy(&[1; 4]), policy(&[9; 4])];
+    let over_seeds = compared(&seeds, &seeds, ComparedScore::Success).means[0].seeds_95;
+    assert_eq!(over_seeds, Some([0.0, 100.0]));
 }
 
 #[test]
@@ -131,6 +135,7 @@ fn table_row(algorithm: &str, seed: u64, tested_on: &str, successes: u64) -> Tab
         trained_on: "R".into(),
         tested_on: Some(tested_on.into()),
         seed,
+        after_episodes: Some(100),
         episodes: Some(100),
         successes: Some(successes),
         mean_return: Some(successes as f64 / 3.0),
@@ -158,9 +163,9 @@ fn rows_of_a_table_give_the_numbers_of_episodes() {
     let expected = compared(&x, &y, ComparedScore::Success);
     let table = |name, counts: [u64; 3]| {
         let row = |seed| table_row(name, seed, "D", counts[seed as usize]);
-        let intermediate = TableRow { successes: Some(1), ..row(0) };
+        let intermediate = TableRow { successes: Some(1), after_episodes: Some(10), ..row(0) };
         let failed = TableRow { tested_on: None, episodes: None, ..table_row(name, 7, "D", 0) };
-        vec![intermediate, row(0), row(1), row(2), failed, table_row(name, 0, SELECTION_TEST, 5)]
+        vec![row(0), intermediate, row(1), row(2), failed, table_row(name, 0, SELECTION_TEST, 5)]
     };
     let (of_x, of_y) = (table("x", counts[0]), table("y", counts[1]));
     let conditions = [rows("y", &of_y), rows("x", &of_x)];
@@ -180,6 +185,9 @@ fn rows_that_are_no_conditions_are_refused() {
     let both = [table_row("a2c", 1, "D", 1), table_row("ppo", 1, "D", 1)];
     let told = error(&[rows("all", &both)], None);
     assert!(told.contains("several policies of seed 1, which differ by algorithm"), "{told}");
+    let twice = [both[0].clone(), both[0].clone()];
+    let told = error(&[rows("two tables", &twice)], None);
+    assert!(told.contains("several policies of seed 1, which differ by study"), "{told}");
     let other = [TableRow { environment: "Acrobot".into(), ..both[1].clone() }];
     let told = error(&[rows("a", &both[..1]), rows("b", &other)], None);
     assert!(told.contains("in Acrobot (revision 1), CartPole (revision 1), but must be one environment"), "{told}");

@@ -51,7 +51,8 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if it has no rows.
+    /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if no
+    /// method has any.
     pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile means and optimality gaps: over all environments and the runs that all of them have, with \
                      95 % stratified bootstrap intervals. If configurations were selected, a second interval repeats the \
@@ -70,7 +71,8 @@ impl Report<'_> {
             table = table.column(column("gap"), move |row| or(MISSING, row.gaps.get(&metric)));
         }
         let table = table.number("runs", |row| self.runs(&row.method, row.iqm_runs())).build();
-        (!table.rows.is_empty()).then_some(table)
+        let is_known = self.averages.iter().any(|row| !row.iqms.is_empty() || !row.gaps.is_empty());
+        is_known.then_some(table)
     }
 
     /// Returns a table for each environment with the success rates in all tests: the nine scenarios, and tests on other

@@ -357,9 +357,16 @@ impl Session {
     ) -> PyResult<Bound<'py, PyArray2<f32>>> {
         let snapshots: Vec<Bytes> = snapshots.into_iter().map(Bytes::from).collect();
         let parts = snapshot_parts(snapshots.iter().map(Bytes::len));
-        // The server refuses a wrong number of snapshots.
-        let all = 0..snapshots.len();
-        let parts = if snapshots.len() == self.selected(mask) { parts } else { vec![all] };
+        let given = snapshots.len();
+        let selected = self.selected(mask);
+        if given != selected && parts.len() > 1 {
+            let words =
+                format!("snapshots has {given} entries, expected {selected}: one for each selected environment");
+            return Err(failure(INVALID, 0, words));
+        }
+        // The server refuses a wrong number of snapshots in one message.
+        let all = 0..given;
+        let parts = if given == selected { parts } else { vec![all] };
         for part in parts {
             let mask = self.part_mask(mask, &part, snapshots.len());
             let open = self.take(0)?;
