@@ -58,7 +58,8 @@ def test_numbers_are_those_of_a_pandas_script(comparison: perturb.Comparison) ->
             assert it.by_seed == pytest.approx(seeds.tolist(), rel=1e-12)
             assert it.mean == pytest.approx(seeds.mean(), rel=1e-12)
             half = T_2 * seeds.sem()
-            assert it.seeds_interval == pytest.approx((it.mean - half, it.mean + half), rel=1e-5)
+            ends = (max(0.0, it.mean - half), min(100.0, it.mean + half))
+            assert it.seeds_interval == pytest.approx(ends, rel=1e-5)
             # Wilson's interval with the effective number of episodes.
             by_episode = frame[frame["condition"] == condition].groupby(address)["percent"].mean() / 100
             p, z = by_episode.mean(), 1.959963984540054
@@ -162,7 +163,8 @@ def test_rows_of_a_results_table_are_compared_by_their_counts() -> None:
             it, seeds = compared.mean(algorithm, tested_on), by_seed[algorithm]
             assert it.by_seed == pytest.approx(seeds.tolist(), rel=1e-12)
             half = T_4 * seeds.sem()
-            assert it.seeds_interval == pytest.approx((seeds.mean() - half, seeds.mean() + half), rel=1e-5)
+            ends = (max(0.0, seeds.mean() - half), min(100.0, seeds.mean() + half))
+            assert it.seeds_interval == pytest.approx(ends, rel=1e-5)
             assert (it.seeds, it.episodes) == (5, 1000)
             own = frame[frame.algorithm == algorithm]
             shares = (own.successes / own.episodes).astype(float)
