@@ -88,7 +88,7 @@ def test_threads_end_with_last_environment() -> None:
     assert physics_threads() == 0, "nothing is started before a reset"
     for one in environments:
         one.reset()
-    assert physics_threads() == os.cpu_count()
+    wait_until(lambda: physics_threads() == os.cpu_count())  # a thread has its name only after its start
     environments[0].close()
     environments[1].step(0)
     environments[1].close()
