@@ -4,12 +4,12 @@ use perturb_protocol::names::{EnvironmentName, is_spelled};
 
 use super::{EnvironmentSpec, Error, shorten};
 
-/// The environments of a server, in a fixed order, with different names.
+/// The environments of a server, in a fixed order. No two of them have the same name.
 #[derive(Debug, Clone, Default)]
 pub struct Catalogue(Vec<&'static EnvironmentSpec>);
 
 impl Catalogue {
-    /// Creates a catalogue of these environments, which must have different names.
+    /// Creates a catalogue of the environments `specs`, in this order. The names must differ from each other.
     pub(crate) fn new(specs: Vec<&'static EnvironmentSpec>) -> Self {
         Self(specs)
     }
@@ -17,8 +17,8 @@ impl Catalogue {
     /// Adds an environment at the end.
     ///
     /// # Errors
-    /// [`Error::NameTaken`] if an environment has the same name. Names that differ only in case, hyphens and
-    /// underscores count as equal.
+    /// [`Error::NameTaken`] if the catalogue already has an environment of the same name. Names that differ only in
+    /// case, hyphens and underscores count as equal.
     pub fn with(mut self, spec: &'static EnvironmentSpec) -> Result<Self, Error> {
         let taken = self.names().find(|name| is_spelled(spec.name, name));
         if let Some(taken) = taken {
@@ -41,7 +41,8 @@ impl Catalogue {
     /// Finds an environment by its name or its Gymnasium id, in any [spelling](perturb_protocol::names).
     ///
     /// # Errors
-    /// [`Error::UnknownEnvironment`] if there is no such environment, or only one of another revision.
+    /// [`Error::UnknownEnvironment`] if no environment has this name, or if the id names another revision than the
+    /// server's.
     pub fn find(&self, name: &str) -> Result<&'static EnvironmentSpec, Error> {
         let known = self.0.iter().map(|spec| (spec.name, spec.revision));
         Ok(self.0[EnvironmentName::new(&shorten(name)).find(known)?])

@@ -106,8 +106,8 @@ pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): 
     })
 }
 
-/// Checks that a distribution is within the parameter's physical range. For a parameter of whole numbers, also checks
-/// that each interval contains one.
+/// Checks that a distribution is within the parameter's physical range. If the parameter takes whole numbers, also
+/// checks that each interval contains a whole number.
 ///
 /// # Errors
 /// [`Error::OutOfRange`], [`Error::NotWhole`].
@@ -130,7 +130,7 @@ pub fn check_distribution(
 /// the distributions of one or two boxes, in the layout of [`Settings::distributions`](super::Settings::distributions).
 ///
 /// # Errors
-/// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. `base` is then unchanged.
+/// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. After an error, `base` is unchanged.
 pub fn resolve<'a>(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
@@ -166,8 +166,8 @@ pub struct Transition {
     pub diverged: bool,
 }
 
-/// The physics and the task of one environment. [`Episodes`](super::Episodes) adds episodes, the step limit and the
-/// drawing of parameters.
+/// The physics and the task of one environment. [`Episodes`](super::Episodes) counts episodes, applies the step limit
+/// and draws parameters.
 ///
 /// A new environment has default parameters and an arbitrary valid state. Set parameters and reset before the first
 /// step. Every method is deterministic: the same calls give the same bytes.
@@ -176,7 +176,7 @@ pub trait Environment: Send {
     fn spec(&self) -> &'static EnvironmentSpec;
 
     /// Applies the parameters `values`, in the order of [`EnvironmentSpec::parameters`], to the unmodified model. Each
-    /// must be within its bounds. The state is undefined until the next reset.
+    /// value must be within its parameter's bounds. The state is undefined until the next reset.
     fn set_parameters(&mut self, values: &[f64]);
 
     /// Reads the quantities of [`EnvironmentSpec::applied`] from the physics, and writes them to `out`, in order.
@@ -187,20 +187,20 @@ pub trait Environment: Send {
         ""
     }
 
-    /// Returns the value that the episode has achieved so far. Only used if the success rule compares
+    /// Returns the value that the episode has achieved so far. It is used only if the success rule compares
     /// [`Achievement::Own`](super::Achievement::Own).
     fn achieved(&self) -> Option<f64> {
         None
     }
 
     /// Sets the seed, environment index and episode index that determine the episode's random numbers, and the number
-    /// of steps that the episode has taken. Called before an episode begins or is loaded. Environments that draw no
-    /// random numbers during steps ignore it.
+    /// of steps that the episode has taken. It is called before an episode begins or is loaded. Environments that draw
+    /// no random numbers during steps ignore this call.
     fn set_address(&mut self, _draw: Draw, _steps: u32) {}
 
     /// Writes the action with the least effect to `out`: a vector with an entry for each channel, or the index of a
     /// choice. By default each entry is the number in its range that is nearest to 0. The default choice is the middle
-    /// one if there is one, otherwise the first.
+    /// choice if their number is odd, otherwise the first choice.
     fn neutral_action(&self, out: &mut [f32]) {
         match self.spec().action {
             ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
@@ -219,7 +219,8 @@ pub trait Environment: Send {
     /// Begins an episode in a random initial state, drawn from `stream`.
     fn reset(&mut self, stream: &mut Stream);
 
-    /// Begins an episode in the given state, which has the entries of [`EnvironmentSpec::state`]. They must be finite.
+    /// Begins an episode in the given state, which has the entries of [`EnvironmentSpec::state`]. All entries must be
+    /// finite.
     fn reset_to(&mut self, state: &[f64]);
 
     /// Writes the current observation to `out`, which has the entries of [`EnvironmentSpec::observation`].
@@ -241,9 +242,10 @@ pub trait Environment: Send {
         0
     }
 
-    /// Loads a state that [`Environment::save`] appended. The same parameters must have been set before.
+    /// Loads a state that [`Environment::save`] appended. The caller must have set the parameters with which the state
+    /// was saved.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the length or a value is impossible. The state is then undefined.
+    /// [`Error::Snapshot`] if the length or a value is impossible. After an error, the state is undefined.
     fn load(&mut self, state: &[f64]) -> Result<(), Error>;
 }

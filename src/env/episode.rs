@@ -101,8 +101,8 @@ pub(super) struct Progress {
     pub(super) reached_at: u32,
     /// The number of consecutive steps, up to the last one, after which the task's goal was met.
     pub(super) held_for: u32,
-    /// The maximal number of consecutive steps after which the task's goal was met. Snapshots store it after the other
-    /// fields, because older snapshots lack it.
+    /// The maximal number of consecutive steps after which the task's goal was met. It is skipped here, because the
+    /// first format of snapshots lacks it. Later formats store it separately, at the end.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -120,8 +120,8 @@ pub struct Episodes {
     pub(super) seen: Option<Box<SeenParameters>>,
 }
 
-/// Returns the number of boxes, 1 or 2, that together have `distributions` distributions, `n` in each box. Returns
-/// `None` if neither number fits. Without parameters there is one box.
+/// Returns into how many boxes, 1 or 2, `distributions` distributions can be divided if each box has `n`. Returns
+/// `None` if neither 1 nor 2 fits. If `n` is 0, there is one box.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }
@@ -174,7 +174,8 @@ impl Episodes {
     }
 
     /// Begins a new trial. `distributions`, if given, replaces the distributions. `seed`, if given, replaces the seed
-    /// and restarts trial and episode numbers at 0. `state` is as in [`Episodes::begin`].
+    /// and restarts trial and episode numbers at 0. If `state` is given, the first episode begins in exactly this
+    /// state.
     pub fn begin_trial(&mut self, seed: Option<u64>, distributions: Option<&[Distribution]>, state: Option<&[f64]>) {
         if let Some(distributions) = distributions {
             self.settings.distributions.clone_from_slice(distributions);
@@ -243,7 +244,7 @@ impl Episodes {
         Outcome { reward, terminated: transition.terminated, truncated }
     }
 
-    /// Updates the observed parameters, if there are any. Call it after parameters were set.
+    /// Updates the observed parameters, if there are any. Call this method after the environment's parameters were set.
     pub(super) fn see_parameters(&mut self) {
         if let Some(seen) = &mut self.seen {
             seen.read(self.environment.as_ref());

@@ -14,7 +14,7 @@ pub(crate) fn shorten(text: &str) -> String {
     }
 }
 
-/// The reason why a request about an environment is refused. The request changes nothing.
+/// The reason why a request about an environment is refused. A refused request changes nothing.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -31,12 +31,12 @@ pub enum Error {
         /// The names of the environment's parameters, separated by commas.
         known: String,
     },
-    /// A distribution is not a union of intervals.
+    /// A requested distribution is not a valid union of intervals.
     #[error("the distribution of {parameter:?} is {}; expected {}", source.got, source.expected)]
     Distribution {
-        /// The parameter's name.
+        /// The name of the parameter that the distribution is for.
         parameter: String,
-        /// The reason why it is not a distribution.
+        /// The reason why the distribution is not valid.
         source: DistributionError,
     },
     /// A value or an interval is not within the parameter's physical range.
@@ -79,7 +79,7 @@ pub enum Error {
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
     Snapshot {
-        /// The reason why it cannot be restored.
+        /// The reason why the snapshot cannot be restored.
         reason: String,
     },
     /// Two environments of a server would have the same name.
@@ -92,7 +92,7 @@ pub enum Error {
         /// The name of the existing environment.
         taken: &'static str,
     },
-    /// The environment could not be created.
+    /// The environment could not be created from its model.
     #[error("{environment} cannot be built: {reason}")]
     Model {
         /// The environment's name.

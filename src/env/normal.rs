@@ -7,7 +7,7 @@ use std::{array, sync::LazyLock};
 const N_LAYERS: usize = 256;
 /// Half the width of the ziggurat's lowest rectangle. The tail of the distribution begins here.
 const EDGE: f64 = 3.654_152_885_361_009;
-/// The area of each layer. That of the lowest layer includes the tail.
+/// The area of each layer, the same for all. The area of the lowest layer includes the tail.
 const AREA: f64 = 0.004_928_673_233_974_655;
 /// The number of equal parts into which half the width of a layer is divided: a random 52-bit number selects one.
 const N_FRACTIONS: f64 = (1u64 << 52) as f64;
@@ -16,7 +16,8 @@ const N_FRACTIONS: f64 = (1u64 << 52) as f64;
 /// lowest rectangle together with the tail.
 #[derive(Debug, Clone, Copy)]
 struct ZigguratLayer {
-    /// Number of parts, from the middle, that are below the curve at every height of the layer.
+    /// The number of the layer's parts, counted from x = 0, that lie under the curve in the layer's whole height. A
+    /// number drawn in them is accepted without a further test.
     inside: u64,
     /// The width of one of the [`N_FRACTIONS`] parts.
     width: f64,
@@ -37,7 +38,8 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
     }
     array::from_fn(|layer| {
         let width = half_widths[layer];
-        // The fraction of the layer's width that is below the layer above, and so below the curve.
+        // The fraction of the layer's width that the next higher layer covers. All points of this fraction are under
+        // the curve.
         let covered = match layer {
             0 => EDGE / width,
             1 => 0.0,

@@ -28,8 +28,8 @@ pub struct Parameter {
 }
 
 impl Parameter {
-    /// Creates a parameter with this physical range, which the quantity of the same name reads back. Set the values of
-    /// the versions by [`Parameter::versions`] or [`Parameter::off`].
+    /// Creates a parameter with the physical range `bounds`. The applied quantity of the same name reads it back. Set
+    /// the values of the versions by [`Parameter::versions`] or [`Parameter::off`].
     pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
         let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
         Self {
@@ -45,7 +45,7 @@ impl Parameter {
         }
     }
 
-    /// Sets the values of the versions: D has the value `default`, R the interval `random`, and E the parts of the
+    /// Sets the values of the versions: D has the value `default`, R the interval `random`, and E the two parts of the
     /// interval `around` that are outside R.
     pub const fn versions(mut self, default: f64, random: (f64, f64), around: (f64, f64)) -> Self {
         self.default = default;
@@ -73,8 +73,8 @@ impl Parameter {
     }
 
     /// Returns the distribution of a version. For R+E, this is the union of the intervals of R and E, although a trial
-    /// draws all parameters from R or all from E. Intervals of length 0 are left out; a task folder may have one on one
-    /// side of R.
+    /// draws all parameters from R or all from E. Intervals of E that have length 0 are left out: in a task folder, E
+    /// may extend to only one side of R.
     pub fn distribution(&self, version: Version) -> Distribution {
         let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {

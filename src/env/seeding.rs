@@ -106,8 +106,8 @@ impl Stream {
     }
 
     /// Draws a uniformly distributed unit vector in the first `n` of three dimensions; its other entries are 0. With
-    /// one dimension it is ±1. With two dimensions the angle is drawn. With three dimensions the last coordinate is
-    /// drawn first, then the angle about the last axis.
+    /// one dimension the first entry is ±1. With two dimensions the angle is drawn. With three dimensions the last
+    /// coordinate is drawn first, then the angle about the last axis.
     pub fn direction(&mut self, n: usize) -> [f64; 3] {
         let last = match n {
             1 => return [if self.unit() < 0.5 { -1.0 } else { 1.0 }, 0.0, 0.0],
@@ -139,8 +139,8 @@ fn philox(mut counter: [u64; 4], mut key: [u64; 2]) -> [u64; 4] {
 mod tests {
     use super::*;
 
-    /// Known answers (counter, key, result): the three lines `philox4x64 10` in `tests/kat_vectors` of Random123
-    /// (Salmon et al.).
+    /// Known answers of the generator, each as (counter, key, result). They are the three lines `philox4x64 10` in the
+    /// file `tests/kat_vectors` of Random123 (Salmon et al.).
     const KNOWN_ANSWERS: [([u64; 4], [u64; 2], [u64; 4]); 3] = [
         ([0; 4], [0; 2], [0x16554D9ECA36314C, 0xDB20FE9D672D0FDC, 0xD7E772CEE186176B, 0x7E68B68AEC7BA23B]),
         (

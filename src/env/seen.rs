@@ -4,7 +4,7 @@ use super::{Environment, EnvironmentSpec, Parameter};
 
 /// The current parameters of one environment, scaled for observations.
 pub(super) struct SeenParameters {
-    /// Each parameter with the index in [`EnvironmentSpec::applied`] of the quantity that reads it back.
+    /// Each parameter, and the index in [`EnvironmentSpec::applied`] of the quantity that reads the parameter back.
     parameters: Vec<(&'static Parameter, usize)>,
     /// A buffer for the values of [`EnvironmentSpec::applied`].
     applied: Vec<f64>,
@@ -29,7 +29,7 @@ impl SeenParameters {
         seen
     }
 
-    /// Updates the entries from the physics. Call it after parameters were set.
+    /// Updates the entries from the physics. Call this method after the environment's parameters were set.
     pub(super) fn read(&mut self, environment: &dyn Environment) {
         environment.applied(&mut self.applied);
         for (entry, (parameter, place)) in self.entries.iter_mut().zip(&self.parameters) {

@@ -9,9 +9,10 @@ use serde::{Deserialize, Serialize};
 
 /// The version of the snapshot format. Every change of [`Saved`], or of the bytes that follow, raises the version.
 const FORMAT: u32 = 3;
-/// The last format without a checksum. Later formats end with the little-endian CRC-32C of all bytes before it.
+/// The last format without a checksum. Later formats end with a checksum: the little-endian CRC-32C of all preceding
+/// bytes.
 const UNSEALED: u32 = 2;
-/// The first format. Later formats have [`Progress::held_longest`] after [`Saved`].
+/// The first format, which has only [`Saved`]. Later formats append [`Progress::held_longest`].
 const FIRST: u32 = 1;
 
 /// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
@@ -21,10 +22,11 @@ const FIRST: u32 = 1;
 /// - delayed actions and observations: 80 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 384 << 10;
 
-/// An upper bound of how much a snapshot grows, in bytes, when its counters grow: small numbers have shorter encodings.
+/// An upper bound of how much a snapshot grows, in bytes, when its counters grow. Large numbers have longer encodings
+/// than small ones.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 
-/// Maximal episode number in a snapshot. The limit keeps later episode numbers from overflowing.
+/// Maximal episode number in a snapshot. With this limit, the numbers of later episodes do not overflow a u64.
 const MAX_EPISODE: u64 = 1 << 63;
 
 /// The content of a snapshot: everything that determines the future of an environment, except the actions. Random
@@ -78,12 +80,12 @@ impl Episodes {
         self.snapshot().len() - distributions_bytes(&self.settings.distributions) + growth
     }
 
-    /// Restores a snapshot. From there the environment gives the same bytes for the same actions as after the snapshot
-    /// was taken.
+    /// Restores a snapshot. For the same actions, the environment then gives the same bytes as it gave after the
+    /// snapshot was taken.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the snapshot is damaged, or is of another environment, revision or model. Nothing is
-    /// changed then.
+    /// [`Error::Snapshot`] if the snapshot is damaged, or is of another environment, revision or model. After an error,
+    /// the environment is unchanged.
     pub fn restore(&mut self, snapshot: &[u8]) -> Result<(), Error> {
         let (saved, distributions) = self.check(snapshot)?;
         let (before, address) = (self.physics_state(), self.draw());
@@ -128,12 +130,12 @@ impl Episodes {
 
 /// Returns the size of distributions in a snapshot, in bytes, without the number of distributions that precedes them.
 pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
-    // A distribution has at most 64 intervals, so their number takes one byte.
+    // The number of a distribution's intervals is at most 64, so its encoding takes one byte.
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// The seed, parameter distributions and current parameters of the environment in a snapshot. They show from which
-/// regions the environment draws.
+/// The seed, parameter distributions and current parameters of the environment in a snapshot. Audits of draws use them
+/// to find the regions of the parameter space from which the environment draws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
     /// The numbers that determine the environment's random numbers.
@@ -160,8 +162,8 @@ impl Saved {
     fn read(spec: &'static EnvironmentSpec, snapshot: &[u8]) -> Result<(Self, Vec<Distribution>), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
         let unreadable = || refuse(format!("its {} bytes are not a snapshot", snapshot.len()));
-        // The limit also bounds the memory for decoding: a list entry of one byte takes more than twenty bytes in
-        // memory.
+        // The limit also bounds the memory for decoding: a list entry that is encoded in one byte takes more than
+        // twenty bytes in memory.
         if snapshot.len() > MAX_SNAPSHOT_BYTES {
             return unreadable();
         }
@@ -177,7 +179,8 @@ impl Saved {
             (format, _) => return refuse(format!("its format is {format}, but this server reads 1 to {FORMAT}")),
         };
         saved.progress.held_longest = match (saved.format, rest) {
-            // The first format has only the current number of steps in a row at the goal. An earlier maximum is lost.
+            // The first format has only the current number of consecutive steps at the goal, so an earlier maximum is
+            // unknown.
             (FIRST, []) => saved.progress.held_for,
             (FIRST, _) => return unreadable(),
             (_, rest) => match postcard::take_from_bytes(rest) {

@@ -11,9 +11,9 @@ pub struct Channel {
     pub low: f64,
     /// Maximum; may be `+inf`.
     pub high: f64,
-    /// The standard deviation that `sensor_noise` = 1 adds to an observed entry, in the entry's unit. By default it is
-    /// half of the range, or 1 without a finite range. An entry with scale 0 is constant: it gets neither noise nor
-    /// dropout.
+    /// The standard deviation that `sensor_noise` = 1 adds to an observed entry, in the entry's unit. By default
+    /// `scale` is half of the range, or 1 if the range is not finite. An entry with scale 0 is constant: it gets
+    /// neither noise nor dropout.
     pub scale: f64,
 }
 
@@ -59,7 +59,7 @@ pub enum Action<'a> {
 pub struct RewardTerm {
     /// The name, unique within the environment.
     pub name: &'static str,
-    /// The term's formula.
+    /// The term's formula, as text.
     pub description: &'static str,
 }
 

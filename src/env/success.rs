@@ -50,7 +50,7 @@ impl Success {
         }
     }
 
-    /// Whether an episode that achieved this value is a success; `None` is not.
+    /// Whether an episode that achieved this value is a success. False for `None`.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.comparison {
             Comparison::AtLeast => achieved >= self.threshold,

@@ -30,15 +30,15 @@ use std::{
 use tokio::{sync::oneshot, time::Instant};
 
 /// The minimum and maximum cost of a step of one shard, µs. The minimum makes the overhead of the queue small in
-/// comparison; the maximum lets sessions take turns.
+/// comparison. The maximum lets other sessions use the worker soon.
 const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
 /// The number of shards for each worker, so that all workers finish at about the same time. There are fewer shards if
-/// these would be cheaper than [`SHARD_COST_US`].
+/// so many would be cheaper than the minimum of [`SHARD_COST_US`].
 const SHARDS_PER_WORKER: f64 = 32.0;
-/// The minimum cost of a worker's part of a batch, µs. Cheaper batches are not split among all workers.
+/// The minimum cost of each worker's part of a batch's step, µs. A cheaper batch is not split among all workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
-/// The maximum number of environments in a batch that is freed on the transport thread. Freeing so few takes only a
-/// moment.
+/// The maximum number of environments in a batch that is freed on the transport thread. Larger batches are freed by the
+/// reaper's thread, since freeing them would block the transport thread for too long.
 const INLINE_DROP_MAX_ENVS: usize = 64;
 
 /// The reset of one environment. It begins a new episode. If there is a new seed or new distributions, it also begins a
@@ -67,7 +67,7 @@ pub struct Batch {
     buffer: BytesMut,
     /// The number of requests that were passed to the workers so far.
     n_requests: u64,
-    /// Whether a request was passed to the workers and its end has not been awaited yet.
+    /// Whether a request was passed to the workers and the session has not yet seen its end.
     is_running: bool,
     /// If the next request is a pipelined step that has already started: its start time.
     pipelined_since: Option<Instant>,
@@ -162,7 +162,7 @@ impl Batch {
         let number = self.next_request();
         let ended = self.workers.wait(&self.job, number).await;
         self.is_running = false;
-        // If a pipelined step followed this one, the worker has already gathered the result of this step.
+        // If a pipelined step followed this step, the worker has already gathered the result of this step.
         let (pipelined_since, end) = {
             let mut pipelined = lock(&self.job.pipelined);
             (pipelined.take_result(), pipelined.ended_at())
@@ -197,10 +197,9 @@ impl Batch {
         follows.then_some(StepQueue { job, spec, size })
     }
 
-    /// Lets a policy play several steps. If `request` has no new policy, the previous policy continues; if it has no
-    /// new task, the previous task continues. The caller must have checked that there is a policy, that a new task does
-    /// not replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the
-    /// batch.
+    /// Lets a policy play several steps. If `request` has no policy, the previous policy continues. If `request` has no
+    /// task, the previous task continues. The caller must have checked that there is a policy, that a new task does not
+    /// replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the batch.
     ///
     /// # Errors
     /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`] if a worker panicked. After an error, the next
@@ -342,9 +341,9 @@ impl Batch {
         }
     }
 
-    /// Waits for a request whose future was dropped before it resolved. Call it before the next request, because
-    /// workers may still be running the old request, and a step queued behind it. A rollout ends after its current
-    /// step.
+    /// Waits for the end of a request whose future was dropped before it resolved. Call this method before the next
+    /// request, because workers may still be running the old request. A queued step that has not started is dropped, and a
+    /// rollout ends after its current step.
     pub async fn finish_abandoned(&mut self) {
         // Errors are ignored here: the next request reports them.
         if self.is_running {
@@ -363,7 +362,7 @@ impl Batch {
     }
 
     /// Returns the scene to draw of a slot's environment, or `None` if its physics diverged. The calling thread reads
-    /// it, since no request is running and little is read.
+    /// the scene itself: no request is running, and reading is cheap.
     ///
     /// # Errors
     /// [`Error::Defect`], if a worker panicked.
@@ -374,8 +373,8 @@ impl Batch {
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
-    /// Returns an upper bound of the length of each environment's snapshot, bytes. It holds until a reset replaces a
-    /// distribution by one with more intervals.
+    /// Returns an upper bound of the length of each environment's snapshot, bytes. The bound holds until a reset
+    /// replaces a distribution by a distribution with more intervals.
     pub fn max_snapshot_bytes(&self) -> usize {
         let own = lock(&self.job.shards[0]).max_snapshot_bytes();
         let distributions = |group: &SlotGroup| distributions_bytes(&group.episodes.distributions);
@@ -467,7 +466,8 @@ impl Drop for Batch {
             }
             return; // frees the environments here, so the pool has room immediately
         }
-        // The last owner of the job frees the environments. It should be neither this thread nor a worker.
+        // The last owner of the job frees the environments. The reaper becomes this owner, so that neither this thread
+        // nor a worker is blocked.
         let mut deferred = Some((Arc::clone(&self.job), self.runner.take(), self.drop_hook.take(), self.freed.take()));
         self.workers.reaper.drop_later(Box::new(move || {
             let is_alone = deferred.as_ref().is_none_or(|(job, ..)| Arc::strong_count(job) == 1);
@@ -500,7 +500,7 @@ fn job(
     Arc::new(Job::new(shards, workers, owned, cost, pipelined))
 }
 
-/// Cuts groups into parts of `size` slots each. The last part may have fewer.
+/// Divides the slots of `groups` into parts of `size` slots each. The last part may have fewer.
 fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
     let (mut parts, mut part, mut free_slots) = (Vec::new(), Vec::new(), size);
     for group in groups {
@@ -509,7 +509,7 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
             let taken = deferred.size.min(free_slots);
             part.push(SlotGroup { size: taken, ..deferred.clone() });
             deferred.size -= taken;
-            // The index may overflow when nothing is left of the group, but then it is never used.
+            // The index may overflow if no slot of the group remains, but then the index is never used.
             deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
             free_slots -= taken;
             if free_slots == 0 {
@@ -522,8 +522,8 @@ fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
     parts
 }
 
-/// Returns the number of environments in a shard. The cost of a shard's step is kept within limits, and every worker
-/// gets a shard if that is worth waking it.
+/// Returns the number of environments in a shard. The cost of a shard's step is kept within [`SHARD_COST_US`]. Each
+/// worker gets at least one shard if its part costs at least [`MIN_WORKER_SHARE_US`].
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;

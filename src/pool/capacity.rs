@@ -16,7 +16,7 @@ pub(super) struct Capacity {
 }
 
 impl Capacity {
-    /// Makes the counter of a pool with room for `limit` environments.
+    /// Makes the counter of a pool that may hold `limit` environments.
     pub(super) fn new(limit: usize) -> Self {
         Self { used: AtomicUsize::new(0), limit, changed: Notify::new() }
     }
@@ -62,7 +62,7 @@ pub(super) struct Permit {
 }
 
 impl Permit {
-    /// Frees the room for `count` environments, at most as many as the permit has.
+    /// Frees the room for `count` of the permit's environments. `count` must not exceed their number.
     pub(super) fn release(&self, count: usize) {
         self.count.fetch_sub(count, Ordering::Relaxed);
         self.capacity.release(count);

@@ -1,4 +1,4 @@
-//! Encodes arrays as messages contain them: little-endian, without gaps.
+//! Encodes arrays in the format of messages: little-endian, without gaps.
 
 use bytes::BytesMut;
 

@@ -14,26 +14,28 @@ use std::{
 };
 use tokio::sync::Notify;
 
-/// The maximum cost of a batch's step that runs on the session's thread, µs. Passing such a step to a worker would take
-/// longer.
+/// The maximum cost of a batch's step that runs on the session's thread, µs. Passing such a cheap step to a worker
+/// would take longer than running it.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// The limit that replaces [`INLINE_MAX_US`], in µs, if the session also made the previous step on the server. Then no
-/// other session is waiting. Up to this cost, a second worker would save less time than passing the batch to it takes.
+/// The limit that replaces [`INLINE_MAX_US`], in µs, if the server's previous step was of the same session, so that no
+/// other session is waiting. Up to this cost, passing the batch to workers takes longer than running it in parallel
+/// saves.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
-/// The maximum cost of a step, µs, of a batch that is also reset on the session's thread. A reset costs as much as a
-/// few steps.
+/// The maximum cost of a batch's step, µs, at which resets of the batch also run on the session's thread. A reset costs
+/// as much as a few steps.
 pub(super) const INLINE_RESET_MAX_US: f64 = 4.0;
-/// The maximum cost of a job's step, µs, at which the session polls for the end of the job before it sleeps.
+/// The maximum cost of a job's step, µs, at which the session polls for the end of the step before it sleeps. For more
+/// expensive steps it sleeps at once.
 const POLL_MAX_US: f64 = 50.0;
-/// The number of polls. Together they take about twice [`POLL_MAX_US`].
+/// The number of polls before the session sleeps. Together the polls take about twice [`POLL_MAX_US`].
 const POLLS_BEFORE_WAIT: usize = 50;
 
-/// The next action of a job after a step.
+/// The work that follows after a job's step.
 pub(super) enum Continuation {
     Nothing,
     /// Runs another step of the rollout.
     Step,
-    /// Runs the pipelined step, which is a request of its own.
+    /// Runs the pipelined step, which belongs to the next request.
     Request,
 }
 
@@ -42,10 +44,10 @@ pub(super) enum Continuation {
 pub(super) struct Job {
     pub(super) shards: Vec<Mutex<Shard>>,
     /// For each worker, the range of shards that it runs first, and the index of the next shard in that range. A worker
-    /// that runs the same environments at each step finds them in its core's cache. When its range is done, it helps
-    /// other workers.
+    /// that runs the same environments at each step finds them in its core's cache. When the worker has finished its
+    /// range, it runs shards of other ranges.
     ranges: Vec<(Range<usize>, AtomicUsize)>,
-    /// The number of parts (shards, or the start of a rollout) that have not finished.
+    /// The number of parts of the running step that have not finished. A part is a shard or the start of a rollout.
     remaining: AtomicUsize,
     /// The running rollout, if there is one.
     rollout: Mutex<Option<Box<RolloutTask>>>,
@@ -122,8 +124,8 @@ impl Job {
         self.remaining.store(self.shards.len(), Ordering::Relaxed);
     }
 
-    /// Claims a shard that no worker has taken, preferably from the worker's own range. There is one, because the
-    /// caller has taken a part from the queue.
+    /// Claims a shard that no worker has taken, preferably from the worker's own range. Such a shard always exists,
+    /// because the caller has taken a part from the queue.
     fn claim(&self, worker: usize) -> usize {
         loop {
             for i in 0..self.ranges.len() {
@@ -165,7 +167,7 @@ impl Job {
         self.done.notify_one();
     }
 
-    /// Decides after a step whether another step follows. None follows if the pool is `closing`.
+    /// Decides after a step whether another step follows. If the pool is `closing`, no step follows.
     pub(super) fn after_step(&self, closing: bool) -> Continuation {
         if self.failed() || self.abandoned.load(Ordering::Relaxed) {
             lock(&self.pipelined).stop();
@@ -184,7 +186,8 @@ impl Job {
         self.catch_panic(Continuation::Step, || rollout.after_step(&self.shards, is_halted))
     }
 
-    /// Returns `next` if `is_wanted` returns true, otherwise `Nothing`. If `is_wanted` panics, marks the job as failed.
+    /// Returns `next` if the closure `is_wanted` returns true, otherwise `Nothing`. If `is_wanted` panics, marks the
+    /// job as failed.
     fn catch_panic(&self, next: Continuation, is_wanted: impl FnOnce() -> bool) -> Continuation {
         match catch_unwind(AssertUnwindSafe(is_wanted)) {
             Ok(true) => next,

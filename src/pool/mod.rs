@@ -66,7 +66,7 @@ pub enum Error {
         /// The first few slots whose episodes have ended, separated by commas.
         slots: String,
     },
-    /// An input or an output of a policy is not finite.
+    /// An input or an output of a policy is not finite. The policy's rollout has ended.
     #[error("the policy's play has ended: {0}; hand over another policy")]
     Policy(#[from] perturb_policy::Error),
     /// A worker panicked, which is a defect of the server. The batch is lost.

@@ -1,5 +1,5 @@
-//! Pipelined steps. A client may request a step while another step is running. The pipelined step starts as soon as the
-//! running step ends. It does not wait until the session has been woken to answer the first request.
+//! Pipelined steps. A client may request a step while another step is running. This pipelined step starts as soon as
+//! the running step ends, before the session has been woken to answer the request of the running step.
 
 use super::{
     shard::{Shard, set_actions},
@@ -12,11 +12,12 @@ use tokio::time::Instant;
 /// The state of a job's pipelined step.
 #[derive(Default)]
 pub(super) struct PipelinedStep {
-    /// Whether a step is running. The worker that ends it checks for a pipelined step.
+    /// Whether a step is running. The worker that finishes the step checks for a pipelined step.
     is_under_way: bool,
     /// The actions of the pipelined step, if one is queued.
     actions: Option<Bytes>,
-    /// The result and end time of the step before the pipelined step. `None` after the session has taken them.
+    /// The result and end time of the step before the pipelined step. `None` after the session has taken result and
+    /// time.
     result: Option<(StepResult, Instant)>,
     /// The time at which a step last ended without a pipelined step in the queue.
     ended: Option<Instant>,
@@ -49,12 +50,13 @@ impl PipelinedStep {
         true
     }
 
-    /// Drops the queued step, and accepts no other until the next step starts.
+    /// Drops the queued step, and accepts no other queued step until the next step starts.
     pub(super) fn stop(&mut self) {
         (self.is_under_way, self.actions) = (false, None);
     }
 
-    /// Takes the result and the end time of the last step, if a pipelined step followed it.
+    /// Takes the result and the end time of the step before the pipelined step. Returns `None` if no pipelined step was
+    /// queued.
     pub(super) fn take_result(&mut self) -> Option<(StepResult, Instant)> {
         self.result.take()
     }

@@ -17,8 +17,9 @@ use std::{
 /// The niceness of the thread. Its priority is low because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// A function that frees a closed session's batch, if no worker uses it any more, and returns whether it did. The
-/// reaper's thread calls it, because freeing thousands of environments would block the transport thread for too long.
+/// A function that frees a closed session's batch if no worker uses the batch any more. It returns whether the batch is
+/// freed. The reaper's thread calls it, because freeing thousands of environments would block the transport thread for
+/// too long.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 /// The interval at which freeing a batch that was still in use is retried.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
@@ -56,14 +57,14 @@ impl Reaper {
         }
     }
 
-    /// Waits until all queued batches have been freed.
+    /// Waits until the thread has freed all queued batches.
     pub(super) async fn idle(&self) {
         while self.pending.load(Ordering::Acquire) > 0 {
             tokio::time::sleep(REAP_INTERVAL).await;
         }
     }
 
-    /// Ends the thread. Later batches are freed by the thread that drops them.
+    /// Ends the thread. A batch that is closed later is freed by the thread that drops it.
     pub(super) fn close(&self) {
         *lock(&self.drops) = None;
     }

@@ -24,11 +24,12 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The number of times that an idle worker yields its core before it sleeps. Waking a sleeping worker takes longer than
-/// a step of many small environments.
+/// The number of times that an idle worker yields its core before it sleeps. Yielding avoids the cost of waking a
+/// sleeping worker, which takes longer than a step of many small environments.
 const YIELDS_BEFORE_SLEEP: usize = 100;
 
-/// The niceness of the workers. The transport threads take precedence, since they work only in short bursts.
+/// The niceness of the workers, which gives them a lower priority than the transport threads. The transport threads
+/// work only in short bursts, so they should not wait for a worker.
 const WORKER_NICENESS: i32 = 1;
 
 /// The worker threads that run batches, and the limit on the number of environments.
@@ -131,7 +132,7 @@ pub(super) struct StepScheduler {
     pub(super) reaper: Reaper,
     pub(super) capacity: Arc<Capacity>,
     queue: Mutex<JobQueue>,
-    /// The number of jobs in the queue, to be read without locking the queue.
+    /// The number of jobs in the queue. It can be read without locking the queue.
     waiting: AtomicUsize,
     ready: Condvar,
     /// Whether the pool is closing. If so, rollouts end after their current step.
@@ -143,8 +144,8 @@ pub(super) struct StepScheduler {
 }
 
 struct JobQueue {
-    /// A FIFO of jobs, each with its number of parts that no worker has taken, at least 1, and the time at which it was
-    /// enqueued. A part is a shard or the start of a rollout.
+    /// A FIFO of entries (job, number of parts, time of enqueueing). The number counts the job's parts that no worker
+    /// has taken, and is at least 1. A part is a shard or the start of a rollout.
     jobs: VecDeque<(Arc<Job>, usize, Instant)>,
     /// The number of workers that sleep until `ready` is notified.
     sleeping: usize,
@@ -152,13 +153,13 @@ struct JobQueue {
 }
 
 impl StepScheduler {
-    /// Runs a step of all shards on the calling thread, if the job is cheap. Returns whether it did.
+    /// Runs a step of all shards on the calling thread, if the job is cheap. Returns whether the step was run.
     pub(super) fn step_inline(&self, job: &Job) -> bool {
         let max_us = if self.mark_last_stepped(job) { INLINE_MAX_US_UNCONTENDED } else { INLINE_MAX_US };
         run_inline(job, max_us)
     }
 
-    /// Runs the resets of all shards on the calling thread, if the job is cheap. Returns whether it did.
+    /// Runs the resets of all shards on the calling thread, if the job is cheap. Returns whether the resets were run.
     pub(super) fn reset_inline(&self, job: &Job) -> bool {
         run_inline(job, INLINE_RESET_MAX_US)
     }
@@ -195,7 +196,7 @@ impl StepScheduler {
         job.take_rollout().ok_or(Error::Defect)
     }
 
-    /// Records that a job is stepped. Returns whether the previously stepped job was the same.
+    /// Records that a job is stepped. Returns whether the previously stepped job was the same job.
     fn mark_last_stepped(&self, job: &Job) -> bool {
         let job = std::ptr::from_ref(job).cast_mut();
         self.last_stepped.swap(job, Ordering::Relaxed) == job
@@ -226,7 +227,7 @@ impl StepScheduler {
         self.waiting.store(queue.jobs.len(), Ordering::Release);
         let sleeping = queue.sleeping;
         drop(queue);
-        // Skipped if no worker sleeps, because a notification is always a system call.
+        // If no worker sleeps, none is notified, because every notification costs a system call.
         match sleeping.min(helpers) {
             0 => {}
             1 => self.ready.notify_one(),
@@ -234,8 +235,8 @@ impl StepScheduler {
         }
     }
 
-    /// Takes one part of the job at the front of the queue. If parts remain, moves the job to the back, for other
-    /// workers. Returns `None` after the queue was closed.
+    /// Takes one part of the job at the front of the queue. If further parts of the job remain, moves the job to the
+    /// back of the queue for other workers. Returns `None` after the queue was closed.
     fn pop(&self) -> Option<Arc<Job>> {
         for _ in 0..YIELDS_BEFORE_SLEEP {
             if self.waiting.load(Ordering::Acquire) > 0 {
@@ -282,8 +283,9 @@ impl StepScheduler {
             }
             job.prepare();
             let shards = job.shards.len();
-            // Waiting jobs come first. If none waits and the job has a single shard, this worker runs the job directly,
-            // because the job is in its cache. From the queue, an idle worker might take the job.
+            // Jobs that wait in the queue come first. If no job waits and this job has a single shard, this worker runs
+            // the job again directly, because the environments are in its core's cache. If the job were queued, another
+            // worker might take it.
             let runs_here = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !runs_here {
                 self.push(job, shards, shards - 1);
@@ -300,7 +302,8 @@ impl StepScheduler {
     }
 }
 
-/// Runs all shards on the calling thread if a step of the job costs at most `max_us` µs. Returns whether it did.
+/// Runs all shards on the calling thread if a step of the job costs at most `max_us` µs. Returns whether the shards
+/// were run.
 fn run_inline(job: &Job, max_us: f64) -> bool {
     if job.cost > max_us {
         return false;

@@ -26,8 +26,8 @@ pub struct BatchSettings {
 pub struct SlotGroup {
     /// The number of slots, at least 1.
     pub size: usize,
-    /// The settings of the group's episodes. They determine all randomness. `environment_index` is the index of the
-    /// first slot; the index of the last slot must fit a u32.
+    /// The settings of the group's episodes. They determine all randomness. `environment_index` is the environment
+    /// index of the group's first slot. The next slots have the next indices; the last index must fit a u32.
     pub episodes: Settings,
 }
 
@@ -43,7 +43,7 @@ impl BatchSettings {
         self.spec.observation.len() + parameters
     }
 
-    /// The number of episodes in a trial, or `None` if groups differ in it.
+    /// The number of episodes in a trial, or `None` if not all groups have the same number.
     pub fn episodes_per_trial(&self) -> Option<u32> {
         let mut each = self.groups.iter().map(|group| group.episodes.episodes_per_trial);
         let first = each.next()?;
@@ -54,7 +54,7 @@ impl BatchSettings {
 /// Gymnasium's three autoreset modes, which determine when an environment is reset after the end of an episode.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Autoreset {
-    /// The next step ignores the environment's action and resets the environment.
+    /// The step after the end of an episode resets the environment, and ignores its action.
     NextStep,
     /// The step that ends the episode also resets the environment.
     SameStep,

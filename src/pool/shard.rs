@@ -22,7 +22,7 @@ pub(super) enum Command {
     /// Begins the next episode in every environment of the shard.
     ResetAll,
     Snapshot(Vec<usize>),
-    /// Restores these snapshots, and keeps the previous states for [`Command::RollBack`].
+    /// Restores these snapshots, each in its slot. Keeps the previous states for [`Command::RollBack`].
     Restore(Vec<(usize, Bytes)>),
     /// Undoes the last restore.
     RollBack,
@@ -90,15 +90,15 @@ pub(super) struct Shard {
 }
 
 impl Shard {
-    /// Makes a shard for the slots of `groups`, of which `first_slot` is the first. [`Command::Open`] creates its
-    /// environments.
+    /// Makes a shard for the slots of `groups`. `first_slot` is its first slot in the batch. [`Command::Open`] creates
+    /// the environments later.
     pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
         Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
 
-    /// Makes a shard of `size` slots from `first_slot` on, with existing environments. Only its observations are valid
-    /// until the next step.
+    /// Makes a shard of `size` slots from `first_slot` on, with existing environments. Until the next step, only the
+    /// observations of its outputs are valid.
     pub(super) fn with_environments(
         settings: &BatchSettings,
         slots: Vec<Episodes>,
@@ -213,7 +213,8 @@ impl Shard {
             for i in 0..group.size {
                 match (self.spec.make)() {
                     Ok(environment) => {
-                        // Cannot overflow: the opener of the batch has checked the group's last index.
+                        // The sum cannot overflow, because the group's last index was checked when the batch was
+                        // opened.
                         let environment_index = group.episodes.environment_index + i as u32;
                         let settings = Settings { environment_index, ..group.episodes.clone() };
                         let episodes = Episodes::new(environment, settings);
@@ -232,14 +233,15 @@ impl Shard {
         }
     }
 
-    /// Advances every environment. Returns the number of environments that took a step. The others began an episode.
+    /// Advances every environment. An environment whose episode had ended begins an episode instead. Returns the number
+    /// of environments that took a step.
     fn step(&mut self) -> usize {
         let (n_terms, mut steps) = (self.terms.len(), 0);
         for slot in 0..self.size {
             let episodes = &mut self.slots[slot];
             if episodes.ended() {
-                // This happens in next-step mode only. Same-step mode leaves no episode ended and restores none.
-                // Disabled mode refuses the step.
+                // Only the autoreset mode next-step gets here with an ended episode. In same-step mode, no ended
+                // episode remains after a step, and none can be restored. In disabled mode, the step was refused.
                 episodes.begin(None);
                 self.rewards[slot] = 0.0;
                 self.terminated[slot] = 0;
@@ -327,7 +329,8 @@ impl Shard {
     }
 
     fn note_start(&mut self, slot: usize) {
-        // Without receipts, clients count episodes themselves; reporting starts would cost a message for every reset.
+        // Starts of episodes are reported only with receipts, because each start costs a message. Clients without
+        // receipts count episodes themselves.
         if self.receipts {
             self.started.push(((self.first_slot + slot) as u32, self.slots[slot].started(true)));
         }

@@ -18,7 +18,7 @@ impl StepQueue {
     /// Queues a step with these actions, if a step is running; otherwise does nothing. The caller must have checked the
     /// actions, and must make this step the batch's next request.
     pub fn enqueue(&self, actions: Bytes) {
-        // If the lock is taken, a worker is already ending the running step. Then it is too late to queue another.
+        // If the lock is taken, a worker is already finishing the running step, and it is too late to queue a step.
         if let Ok(mut pipelined) = self.job.pipelined.try_lock() {
             pipelined.offer(actions);
         }

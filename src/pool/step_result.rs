@@ -29,11 +29,12 @@ pub struct StepResult {
     pub ended: Vec<(u32, EpisodeEnd)>,
     /// The episodes that autoreset began, each with its slot. Empty unless receipts are sent as messages.
     pub started: Vec<(u32, EpisodeStart)>,
-    /// The episodes of `receipt_values`, u64 `[M, 5]`. Empty unless receipts are sent as arrays. Columns: slot,
-    /// environment index, trial index, episode index, number within the trial. The K ended episodes come before the
-    /// episodes that began.
+    /// The M episodes whose receipts `receipt_values` has, u64 `[M, 5]`. Empty unless receipts are sent as arrays.
+    /// Columns: slot, environment index, trial index, episode index, number within the trial. The K ended episodes come
+    /// before the episodes that began.
     pub receipt_episodes: Bytes,
-    /// The receipts of these M episodes, f64 `[M, P + Q]`: P requested values, then Q applied values.
+    /// The receipts of the M episodes in `receipt_episodes`, f64 `[M, P + Q]`: P requested values, then Q applied
+    /// values.
     pub receipt_values: Bytes,
 }
 
@@ -45,7 +46,7 @@ pub(super) struct ShardOutputs<'a> {
 }
 
 impl ShardOutputs<'_> {
-    /// Gathers the result of the last step. The terms of the rewards are omitted unless `reward_terms`.
+    /// Gathers the result of the last step. It contains the terms of the rewards only if `reward_terms` is true.
     pub(super) fn step_result(mut self, reward_terms: bool) -> StepResult {
         StepResult {
             observations: self.observations(),
@@ -73,7 +74,8 @@ impl ShardOutputs<'_> {
         self.buffer.split().freeze()
     }
 
-    /// Gathers a column of the receipts: first of all ended episodes, then of all episodes that began.
+    /// Gathers one array of the receipts: first the receipts of all ended episodes, then those of all episodes that
+    /// began.
     fn receipts<T: Copy>(&mut self, column: fn(&ReceiptColumns) -> &Vec<T>, encode: fn(T) -> [u8; 8]) -> Bytes {
         let parts: [fn(&Shard) -> &ReceiptColumns; 2] =
             [|shard| &shard.ended_receipts, |shard| &shard.started_receipts];

@@ -3,24 +3,24 @@
 use super::{next_place, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
 
-/// Disturbs the actions of one environment on their way to the physics. Actions are stored as numbers: A channels, or
-/// the index of a choice with A = 1.
+/// Disturbs the actions of one environment on their way to the physics. An action is stored as A numbers: a continuous
+/// action as one number per channel, a discrete action as the index of its choice (A = 1).
 pub(super) struct ActionPath {
     space: ActionSpace,
     /// The action that acts until the client's first action arrives, `[A]`.
     neutral: Vec<f32>,
-    /// A ring buffer of the delayed actions, which have not acted yet, `[action_delay, A]`.
+    /// A ring buffer of the client's actions that have not reached the physics yet, `[action_delay, A]`.
     late: Vec<f32>,
     /// The index in `late` of the first number of the oldest action.
     oldest: usize,
-    /// The last action that acted, before noise and scale, `[A]`.
+    /// The action of the current step before noise and scale, `[A]`. `action_hold` may repeat it in the next step.
     held: Vec<f32>,
-    /// The action that acts now, with noise and scale, `[A]`.
+    /// The action of the current step with noise and scale, which the physics receive, `[A]`.
     acting: Vec<f32>,
 }
 
 impl ActionPath {
-    /// Creates the path for an action space. `neutral` is the environment's action with the least effect, `[A]`.
+    /// Creates the path for actions of `space`. `neutral` is the environment's action with the least effect, `[A]`.
     pub(super) fn new(space: ActionSpace, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
         Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
@@ -36,7 +36,7 @@ impl ActionPath {
         self.held.copy_from_slice(&self.neutral);
     }
 
-    /// Takes the client's action in step number `step`. Returns the action that acts in this step.
+    /// Takes the client's action for step number `step`, counted from 0. Returns the disturbed action for the physics.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -53,7 +53,7 @@ impl ActionPath {
                 &choice
             }
         };
-        // `held` becomes the action that arrives now, unless the previous one is repeated.
+        // `held` becomes the client's action after its delay. If the step repeats the previous action, `held` stays.
         let width = self.neutral.len();
         let is_held = values.action_hold > 0.0
             && step > 0
@@ -70,7 +70,7 @@ impl ActionPath {
             place.copy_from_slice(action);
             self.oldest = next_place(self.oldest, width, self.late.len());
         }
-        // Noise and scale apply to the acting action only, not to `held`.
+        // Noise and scale change only `acting`, so a repeated action gets new noise.
         self.acting.copy_from_slice(&self.held);
         match self.space {
             ActionSpace::Discrete(_) => Action::Discrete(self.acting[0] as u32),
@@ -98,7 +98,7 @@ impl ActionPath {
         (1 + values.action_delay) * self.neutral.len()
     }
 
-    /// Appends the last action that acted, then the delayed actions, oldest first.
+    /// Appends `held`, then the delayed actions, oldest first.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
         let (newer, older) = self.late.split_at(self.oldest);
         out.extend([&self.held[..], older, newer].into_iter().flatten().map(|&number| f64::from(number)));
@@ -107,7 +107,7 @@ impl ActionPath {
     /// Loads the numbers that [`ActionPath::save`] appended. Their count must be [`ActionPath::n_saved`].
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if a number is not valid in an action. The path is then undefined.
+    /// [`Error::Snapshot`] if a number is not valid in an action. After an error, the state of the path is undefined.
     pub(super) fn load(&mut self, values: &DisturbanceValues, saved: &[f64]) -> Result<(), Error> {
         let is_legal = |&number: &f64| match self.space {
             ActionSpace::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),

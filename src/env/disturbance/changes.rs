@@ -32,8 +32,9 @@ impl ChangingPhysics {
         Self { environment, is_changing: false, is_changed: false, sets, applied, places, state: Vec::new() }
     }
 
-    /// Sets the normal parameters `own` and the changed ones in `values`. If the physics can change, reads both back
-    /// from the physics. The state is undefined until the next reset.
+    /// Stores the normal parameters `own` and the changed parameters `values.changed`, and applies the normal ones. If
+    /// the physics can change, also reads the quantities of both sets back from the physics. The state is undefined
+    /// until the next reset.
     pub(super) fn set_parameters(&mut self, own: &[f64], values: &DisturbanceValues) {
         self.is_changing = values.is_changing();
         self.is_changed = false;
@@ -54,13 +55,14 @@ impl ChangingPhysics {
         if self.is_changing { out.copy_from_slice(&self.applied[0]) } else { self.environment.applied(out) }
     }
 
-    /// Returns the changed value of a parameter, read back from the physics. `None` if the physics cannot change.
-    /// `parameter` is its index.
+    /// Returns the value that the parameter with index `parameter` has in the changed set, read back from the physics.
+    /// Returns `None` if the physics cannot change.
     pub(super) fn changed(&self, parameter: usize) -> Option<f64> {
         self.is_changing.then(|| self.applied[1][self.places[parameter]])
     }
 
-    /// Prepares a new episode: sets the normal parameters. If the physics were changed, the state is then undefined.
+    /// Prepares a new episode: applies the normal parameters if the physics have the changed set. The state is then
+    /// undefined until the next reset.
     pub(super) fn begin(&mut self) {
         if self.is_changed {
             self.is_changed = false;
@@ -72,7 +74,7 @@ impl ChangingPhysics {
     /// same.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the state is not valid with the other parameters. It is then undefined.
+    /// [`Error::Snapshot`] if the state is not valid with the other parameters. After an error, the state is undefined.
     pub(super) fn pass(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> Result<(), Error> {
         if !(self.is_changing && begins_with_change(values, draw, step)) {
             return Ok(());
@@ -93,7 +95,7 @@ impl ChangingPhysics {
     /// Restores a state that [`save`](Self::save) appended.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if the state is not valid. It is then undefined.
+    /// [`Error::Snapshot`] if the state is not valid. After an error, the state is undefined.
     pub(super) fn load(&mut self, saved: &[f64]) -> Result<(), Error> {
         let (own, is_changed) = match saved {
             [own @ .., 0.0] => (own, false),

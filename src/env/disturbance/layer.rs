@@ -17,7 +17,7 @@ pub(super) struct Disturbed {
     physics: ChangingPhysics,
     spec: &'static EnvironmentSpec,
     set: &'static DisturbanceSet,
-    /// The requested values of the disturbances, in order.
+    /// The requested values of the disturbances, in the order of the parameters of `set`.
     numbers: Vec<f64>,
     values: DisturbanceValues,
     draw: Draw,
@@ -28,8 +28,8 @@ pub(super) struct Disturbed {
 }
 
 impl Disturbed {
-    /// Wraps `inner`. `spec` describes the disturbed twin, `set` its disturbances. They have no effect until
-    /// `set_parameters`.
+    /// Wraps `inner`. `spec` describes the disturbed twin, `set` its disturbances. The disturbances have no effect
+    /// until `set_parameters` is called.
     pub(super) fn new(
         inner: Box<dyn Environment>,
         spec: &'static EnvironmentSpec,
@@ -137,7 +137,7 @@ impl Environment for Disturbed {
     }
 
     /// Appends the state of the physics, then the delayed actions, then the delayed observations. The observation that
-    /// the policy sees is not stored: `load` computes it again from these and the random stream.
+    /// the policy sees is not stored: `load` computes it again from the saved numbers and the random stream.
     fn save(&self, out: &mut Vec<f64>) {
         self.physics.save(out);
         self.actions.save(out);

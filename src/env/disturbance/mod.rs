@@ -43,8 +43,8 @@ pub fn possible(spec: &EnvironmentSpec) -> Vec<Parameter> {
     DisturbanceSet::new(spec).parameters().collect()
 }
 
-/// Makes an environment whose own parameters include all disturbances. `declared` replaces disturbances of the same
-/// name; so versions R and E may draw other values than the default. The environment has no further disturbances: it is
+/// Makes an environment whose own parameters include all disturbances. A parameter in `declared` replaces the
+/// disturbance of the same name, so that versions R and E can draw other values than the default. The environment is
 /// its own disturbed twin.
 pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'static EnvironmentSpec {
     let mut set = DisturbanceSet::new(spec);
@@ -66,8 +66,8 @@ pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
 }
 
-/// Returns the environment that has parameters with these names: the disturbed twin if one of them is a disturbance,
-/// otherwise `spec` itself.
+/// Returns the environment that has parameters with these names: the disturbed twin if one of the names is a
+/// disturbance, otherwise `spec` itself.
 ///
 /// # Errors
 /// [`Error::UnknownParameter`] for a name that is neither a parameter nor a disturbance.
@@ -127,7 +127,7 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
     disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(set.parameters()).collect());
     disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());
     // An environment refers to its spec, and the spec holds the closure that creates the environment. The cell breaks
-    // this cycle: the closure reads the spec's address from it, which is set below.
+    // this cycle: it is filled with the spec's address below, and the closure reads the address from it.
     let address: &'static OnceLock<&'static EnvironmentSpec> = Box::leak(Box::default());
     disturbed.make = Box::leak(Box::new(move || {
         let disturbed = address.get().expect("nobody has the closure before the address is set");
@@ -136,8 +136,8 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
     address.get_or_init(|| Box::leak(Box::new(disturbed)))
 }
 
-/// Returns the offset of the entry after the one at offset `place`, in a ring buffer of `length` numbers with entries
-/// of `width` numbers. A comparison is used, because the remainder would cost a division in each step.
+/// Returns the offset of the entry that follows the entry at offset `place`, in a ring buffer of `length` numbers with
+/// entries of `width` numbers. It compares, because a remainder would cost a division in each step.
 fn next_place(place: usize, width: usize, length: usize) -> usize {
     let next = place + width;
     if next < length { next } else { 0 }

@@ -9,9 +9,10 @@ const MAX_DELAY: usize = 100;
 const MAX_LATE_ACTION_NUMBERS: usize = 2048;
 /// Maximal total of numbers in all delayed observations of an environment. It limits the size of snapshots.
 const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
-/// Maximal number of actuators with a scale of their own.
+/// Maximal number of actuators that have their own scale: the first actuators of the environment. The common scale
+/// applies to all actuators.
 const MAX_SCALED_ACTUATORS: usize = 32;
-/// Maximal value of noise and of scales, dimensionless.
+/// Maximal value of the noise parameters and of the action scales, dimensionless.
 const MAX_FACTOR: f64 = 10.0;
 /// Maximal size of a push, in the unit of [`PushSpec::unit`](crate::env::PushSpec::unit).
 const MAX_PUSH: f64 = 1000.0;
@@ -39,18 +40,18 @@ pub(super) enum DisturbanceKind {
     ChangeAt,
     ChangeEvery,
     ChangeProbability,
-    /// The value, after a change of the physics, of the environment's own parameter with this index.
+    /// The value that the environment's own parameter with this index has after a change of the physics.
     Changed(usize),
 }
 
 /// The disturbances of one environment.
 pub(super) struct DisturbanceSet {
     entries: Vec<(DisturbanceKind, Parameter)>,
-    /// A, the number of entries of an action; 1 if an action is a choice.
+    /// A, the number of entries of a continuous action; 1 if actions are discrete.
     pub(super) action_width: usize,
 }
 
-/// The current values of the disturbances.
+/// The current values of the disturbances, decoded from parameters.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct DisturbanceValues {
     pub(super) action_delay: usize,
@@ -65,7 +66,7 @@ pub(super) struct DisturbanceValues {
     pub(super) sensor_delay: usize,
     pub(super) sensor_noise: f64,
     pub(super) sensor_dropout: f64,
-    /// The number of steps after which the physics change; 0 for never.
+    /// The number of steps of an episode after which the physics change once; 0 for never.
     pub(super) change_at: u32,
     /// The number of steps between two changes of the physics; 0 for never.
     pub(super) change_every: u32,
@@ -81,8 +82,9 @@ impl DisturbanceValues {
     }
 }
 
-/// Returns the disturbances that change the physics within an episode. For each parameter of the environment there is
-/// one with the prefix `changed_`: its value after a change, which the versions draw from the same distributions.
+/// Returns the disturbances that change the physics within an episode. For each parameter `x` of the environment there
+/// is a disturbance `changed_x`, the value of `x` after a change. Each version draws it from the same distribution as
+/// `x`.
 fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, Parameter)> {
     if spec.parameters.is_empty() {
         return Vec::new();
@@ -130,7 +132,7 @@ impl DisturbanceSet {
                 share("action_hold", "probability that the last action acts again", 1.0).off(0.0),
             ),
         ];
-        // A choice has no magnitude, so it can have neither noise nor a scale.
+        // A discrete action has no magnitude, so it has neither noise nor a scale.
         if let Some(channels) = actuators {
             let noise = share("action_noise", "standard deviation of actions, as a share of their range", MAX_FACTOR);
             entries.push((DisturbanceKind::ActionNoise, noise.off(0.0)));
@@ -179,7 +181,8 @@ impl DisturbanceSet {
         Self { entries, action_width }
     }
 
-    /// Replaces disturbances by the parameters of the same name in `declared`, whose versions draw other values.
+    /// Replaces disturbances by the parameters of the same name in `declared`, whose distributions for R and E may
+    /// differ.
     pub(super) fn declare(&mut self, declared: &[Parameter]) {
         for (_, parameter) in &mut self.entries {
             if let Some(own) = declared.iter().find(|own| own.name == parameter.name) {
@@ -193,8 +196,8 @@ impl DisturbanceSet {
         self.entries.iter().map(|(_, parameter)| *parameter)
     }
 
-    /// Returns the maximal total of numbers in delayed actions, and in delayed observations of `observation_size`
-    /// numbers each.
+    /// Returns how many numbers the delayed actions of an environment have together at most, and how many its delayed
+    /// observations, of `observation_size` numbers each.
     pub(super) fn max_late_numbers(&self, observation_size: usize) -> (usize, usize) {
         let longest = |wanted: DisturbanceKind| {
             let entry = self.entries.iter().find(|(kind, _)| *kind == wanted);
@@ -248,9 +251,8 @@ impl DisturbanceSet {
     }
 
     /// Writes the values of the disturbances to `out`, in order, as read back from `values`. `numbers` are the values
-    /// that were set. Scales are copied from them, because `values` has only the product of the scale of all actuators
-    /// and an actuator's own scale. `changed` returns the value of the parameter with this index after a change, if the
-    /// physics can change.
+    /// that were set. Scales are copied from `numbers`, because `values` has only products of two scales. `changed(i)`
+    /// returns the changed value of parameter `i`, or `None` if the physics cannot change.
     pub(super) fn read(
         &self,
         values: &DisturbanceValues,

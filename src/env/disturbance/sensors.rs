@@ -6,8 +6,8 @@ use crate::env::{Channel, Draw, Error, Purpose, Stream};
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
 pub(super) struct SensorPath {
     channels: &'static [Channel],
-    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the policy sees the oldest one now, with noise and
-    /// dropout; the others are still delayed.
+    /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the policy sees the oldest observation now, with
+    /// noise and dropout; the newer ones are still delayed.
     exact: Vec<f32>,
     /// The index in `exact` of the first number of the newest observation.
     newest: usize,
@@ -21,8 +21,8 @@ impl SensorPath {
         Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
     }
 
-    /// Begins an episode. `observe` writes the first exact observation. The policy sees it, disturbed, until the second
-    /// one arrives.
+    /// Begins an episode. `observe` writes the first exact observation. The policy sees this observation, with noise
+    /// and dropout, until the second observation has passed the delay.
     pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
         self.exact.resize((values.sensor_delay + 1) * width, 0.0);
@@ -33,7 +33,8 @@ impl SensorPath {
         self.see(values, draw, 0);
     }
 
-    /// Adds an exact observation, which `observe` writes, after `steps` steps of the episode.
+    /// Adds the exact observation after `steps` steps of the episode, which `observe` writes. Updates the observation
+    /// that the policy sees.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -96,7 +97,7 @@ impl SensorPath {
     /// writes the newest exact observation.
     ///
     /// # Errors
-    /// [`Error::Snapshot`] if a number is not finite as float32. The path is then undefined.
+    /// [`Error::Snapshot`] if a number is not finite as float32. After an error, the state of the path is undefined.
     pub(super) fn load(
         &mut self,
         values: &DisturbanceValues,

@@ -14,7 +14,7 @@ use perturb_policy::{
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
 
-/// A policy as a client sent it, before its first step. The sender has checked that its parts fit each other and the
+/// A policy as a client sent it, before its first step. The session has checked that the fields fit each other and the
 /// batch.
 #[derive(Debug, Clone)]
 pub struct Policy {
@@ -22,7 +22,7 @@ pub struct Policy {
     pub spec: PolicySpec,
     /// The builder of the networks' inputs, in its initial state.
     pub inputs: Inputs,
-    /// The normalisers of observations and rewards.
+    /// The normalisers of observations and rewards, with their running statistics.
     pub normalisers: Normalisers,
     /// Whether the policy is trained or tested, with the random stream of its actions.
     pub role: PolicyRole,
@@ -39,16 +39,17 @@ pub struct Policy {
 #[derive(Debug, Clone)]
 #[allow(clippy::large_enum_variant)] // there is only one for each policy
 pub enum PolicyRole {
-    /// All actions are drawn from this stream. The normalisers' statistics are updated.
+    /// In training, all actions are drawn from this stream. The normalisers' statistics are updated.
     Training(ChaCha8Rng),
-    /// Each trial has its own stream, from which its actions are drawn. The normalisers' statistics are frozen.
+    /// In a test, each trial has its own stream, from which its actions are drawn. The normalisers' statistics are
+    /// frozen.
     Testing {
         /// The seed, which together with the environment index and the trial index determines a trial's stream.
         seed: u64,
     },
 }
 
-/// A policy that plays a batch, in its state between two steps.
+/// A policy that plays a batch, with the state that it keeps between two steps.
 pub struct PolicyRunner {
     player: Player,
     pub(in crate::pool) task: RemainingRollout,
@@ -73,7 +74,8 @@ pub(in crate::pool) struct StepBuffers {
 }
 
 impl PolicyRunner {
-    /// Starts a policy in the environments of `shards`: from its saved state, or at the start of a trial.
+    /// Starts a policy in the environments of `shards`. It continues from the policy's saved state, or begins a trial
+    /// if there is none.
     pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =
@@ -122,7 +124,7 @@ impl PolicyRunner {
         matches!(task, CollectUntil::Episodes(_))
     }
 
-    /// Starts the episodes of a task, after all environments were reset.
+    /// Starts the episodes of a task. Call this method after all environments were reset.
     pub(in crate::pool) fn begin_episodes(&mut self, shards: &[Mutex<Shard>]) -> Result<(), Error> {
         let Self { player, task, seed, step, .. } = self;
         step.gather_observations(shards);
@@ -137,7 +139,7 @@ impl PolicyRunner {
         Ok(())
     }
 
-    /// Chooses the next actions and gives them to the shards. Returns them, encoded as in messages.
+    /// Chooses the next actions and gives them to the shards. Returns the actions, encoded as in messages.
     pub(in crate::pool) fn act(&mut self, shards: &[Mutex<Shard>]) -> Result<&[u8], Error> {
         let actions = self.player.act()?;
         set_actions(shards, actions);

@@ -31,13 +31,13 @@ const INITIAL_CAPACITY_STEPS: usize = 256;
 pub struct RolloutRequest {
     /// The policy to play; if `None`, the previous policy continues.
     pub policy: Option<Policy>,
-    /// New weights for the previous policy, `[P]`, finite; if `None`, it keeps its weights.
+    /// New weights for the previous policy, `[P]`, finite; if `None`, the policy keeps its weights.
     pub weights: Option<Vec<f32>>,
     /// The task to start: the steps or episodes that the policy has to play. If `None`, the previous task continues.
     pub task: Option<CollectUntil>,
     /// The maximum number of steps in this rollout, at least 1.
     pub max_steps: usize,
-    /// Whether only ended episodes are recorded, and no steps.
+    /// Whether the reply contains only the ended episodes, and no arrays of steps.
     pub only_ended: bool,
 }
 
@@ -66,7 +66,7 @@ pub struct Rollout {
     /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`.
     pub truncation_values: BytesMut,
     /// The episodes that ended, ordered by step, then by slot. If the task is a number of episodes per environment,
-    /// later episodes of an environment are left out.
+    /// episodes beyond this number are left out.
     pub ended: Vec<EndedAt>,
     /// Whether the policy's task was finished in this rollout.
     pub finished: bool,
@@ -82,7 +82,7 @@ pub struct Rollout {
 /// An episode that ended during a rollout.
 #[derive(Debug, Clone, PartialEq)]
 pub struct EndedAt {
-    /// The step in which the episode ended, from 0 at the start of the rollout.
+    /// The number of the step in which the episode ended, counted from 0 at the start of the rollout.
     pub step: usize,
     /// The slot of the environment.
     pub slot: u32,
@@ -94,13 +94,13 @@ pub struct EndedAt {
     pub truncated: bool,
 }
 
-/// The event for which a rollout is waiting.
+/// The next event that advances a rollout.
 enum RolloutPhase {
-    /// A worker that starts the rollout.
+    /// A worker starts the rollout.
     Begin,
-    /// The reset of all environments.
+    /// The reset of all environments ends.
     Reset,
-    /// A step of all environments.
+    /// A step of all environments ends.
     Step,
 }
 
@@ -125,8 +125,9 @@ impl RolloutTask {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Call it each time the shards have carried out a command. Records the outputs of the command and gives the shards
-    /// the next one. Returns false at the end of the rollout. If `halted`, the rollout ends now.
+    /// Records the outputs of the shards' last command and gives the shards the next command. Call this method each
+    /// time all shards have carried out a command. Returns false at the end of the rollout. If `halted`, the rollout
+    /// ends now.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(continues) => continues && !halted,
@@ -185,7 +186,7 @@ impl RolloutTask {
 }
 
 impl Rollout {
-    /// Allocates the arrays. If a task `begins`, also records the policy's memory.
+    /// Allocates the arrays. If `begins`, a new task begins in this rollout, and the policy's memory is also recorded.
     fn begin(&mut self, runner: &PolicyRunner, begins: bool, request: &RolloutRequest) {
         if request.only_ended {
             return;
