@@ -89,7 +89,8 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
     let mut audits = Vec::new();
     for policy in &policies {
         match policy.audit(&servers, max_episodes, &stop) {
-            // The command itself fails if there is only one policy, or if a signal stopped it.
+            // If the audit of one of several policies fails, the command goes on with the other policies. An error ends
+            // the command if there is only one policy, or if a signal came.
             Err(error) if policies.len() == 1 || stop.signal().is_some() => return Err(error),
             audit => audits.push((policy.name(), audit.map_err(|error| error.to_string()))),
         }
@@ -109,13 +110,13 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
         let count = if policies.len() == 1 { "1 policy".to_owned() } else { format!("{} policies", policies.len()) };
         match same {
             Some(same) => writeln!(output(), "{same} of {replayed} episodes of {count} have the same bytes")?,
-            None => writeln!(output(), "{different} tests of {count} have other episodes")?,
+            None => writeln!(output(), "{different} tests of {count} differ from the recorded tests")?,
         }
     }
     Ok(if different == 0 && finished().count() == policies.len() { ExitCode::SUCCESS } else { ExitCode::FAILURE })
 }
 
-/// Returns the servers' arguments. If the records belong to an experiment, they include the task folders of its plan.
+/// Returns the options of the servers. If the records belong to an experiment, adds the task folders of its plan.
 fn server_args(args: &AuditArgs) -> Result<ServerArgs> {
     let path = std::path::absolute(&args.dir).map_err(system("find the absolute path of the records"))?;
     let mut folders = path.ancestors().take(MAX_DEPTH).map(|path| Folder::new(path).plan_path());

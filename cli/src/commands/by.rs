@@ -114,13 +114,13 @@ fn labels(records: &Records, set: &str, by: &str, contexts: &Contexts) -> Result
         let several = if distinct.len() > 1 { distinct } else { Vec::new() };
         return Ok(several.into_iter().map(|value| (value.to_string(), within(value, value))).collect());
     }
-    let mut told = vec![false; values.len()];
+    let mut counted = vec![false; values.len()];
     let mut found = Vec::new();
     for bin in bins(std::iter::once(&outcomes), parameter) {
         // A value on the edge between two bins belongs to the lower bin, so that each episode counts once.
         let mut places = within(bin.low, bin.high);
-        places.retain(|&place| !told[place]);
-        places.iter().for_each(|&place| told[place] = true);
+        places.retain(|&place| !counted[place]);
+        places.iter().for_each(|&place| counted[place] = true);
         if !places.is_empty() {
             found.push((format!("{:.4} … {:.4}", bin.low, bin.high), places));
         }

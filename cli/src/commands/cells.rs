@@ -54,8 +54,9 @@ impl<'a> PlanRunner<'a> {
         Ok(Self { args, folder, done, stop, plan, retryable, end: None, rates: Vec::new(), events })
     }
 
-    /// Returns the plan of the next round: the given plan, and then the same plan with the selected cells. It does not
-    /// have the finished cells of --done. Returns `None` when no round is left.
+    /// Returns the plan of the next round. In the first round it is the given plan. In the second round it also has the
+    /// cells that tuning selected. Cells that are finished in the table of --done are left out. Returns `None` when no
+    /// round is left.
     pub(super) fn next_round(&mut self) -> Result<Option<Plan>> {
         match self.end {
             None => {}
@@ -145,7 +146,7 @@ impl<'a> PlanRunner<'a> {
     }
 }
 
-/// Returns the states of cells in `folder`. Cells that are missing there have their states in `done`.
+/// Returns the states of cells. A cell's state is read from `folder`, or from `done` if the cell is not in `folder`.
 pub(super) fn layered<'a>(folder: &'a Folder, done: Option<&'a DoneCells<'a>>) -> LayeredStates<'a> {
     LayeredStates { first: folder, then: done.map(|done| done as &dyn CellStates) }
 }
@@ -164,7 +165,7 @@ pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Resu
 }
 
 /// Copies the plan into its folder, and prints a note if it replaces another plan. With --cell an existing plan is not
-/// replaced, because a job that waited in a queue may have an older plan.
+/// replaced: the command may be a queued job, whose plan is older than the plan in the folder.
 fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
     let path = folder.plan_path();
     if !args.cell.is_empty() && path.exists() {

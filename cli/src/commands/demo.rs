@@ -45,7 +45,7 @@ const POINT_EPISODES: u64 = 5;
 const MAX_TRIES: u64 = 20;
 /// Width and height of the films.
 const PIXELS: (u32, u32) = (240, 240);
-/// Number of steps between two frames of the films. It limits the time of drawing, about 60 ms for a robot.
+/// Number of steps between two frames of the films. Not every step is drawn, because a robot's frame takes about 60 ms.
 const FRAME_STEPS: u32 = 8;
 
 /// A trained policy with its success rate on each version, in percent.
@@ -157,7 +157,8 @@ impl Demo<'_> {
         Ok(DemoPolicy { version, checkpoint: outcome.checkpoint, rates })
     }
 
-    /// Returns a table of these results beside the paper's, with the numbers of runs and episodes of both.
+    /// Returns a table with two rows: the results of `trained`, and the paper's results. It also shows the numbers of
+    /// runs and episodes.
     fn comparison_table(&self, environment: &str, trained: &[DemoPolicy]) -> Table {
         let rates: BTreeMap<Scenario, f64> = trained
             .iter()
@@ -272,7 +273,8 @@ fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     }
 }
 
-/// Calls two functions in parallel. A single training leaves a core idle, because server and learner work alternately.
+/// Calls two functions, such as two trainings, in parallel. A single training would leave a core idle, because its
+/// server and its learner work alternately.
 fn side_by_side<A: Send, B: Send>(first: impl FnOnce() -> A + Send, second: impl FnOnce() -> B) -> (A, B) {
     std::thread::scope(|scope| {
         let first = scope.spawn(first);

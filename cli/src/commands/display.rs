@@ -141,7 +141,7 @@ impl Display {
         display
     }
 
-    /// Makes the display of a task with `total` episodes.
+    /// Makes the display of a training or test with `total` episodes.
     pub(super) fn for_episodes(what: impl Into<String>, total: u64) -> Self {
         Self::new(format!("{} ", what.into()), "episodes", total)
     }
@@ -153,7 +153,7 @@ impl Display {
 
     fn new(what: String, unit: &'static str, total: u64) -> Self {
         let bar = (std::io::stderr().is_terminal() && !is_quiet()).then(|| Bar::new(&what, total));
-        // A task in episodes waits one interval before its first line, so a short task prints none.
+        // A training or test prints its first line after one interval, so a short one prints no line.
         let last_line = (unit == "episodes").then(Instant::now);
         Self { bar, what, unit, total, pace: None, start: Instant::now(), last_line }
     }

@@ -145,7 +145,7 @@ impl CommandError {
         }
     }
 
-    /// Tells whether the reader of the output has ended, as in `perturb envs | head`.
+    /// Tells whether the program that reads the output has ended early, e.g. `head` in `perturb envs | head`.
     pub(super) fn is_closed_pipe(&self) -> bool {
         match self {
             Self::Output(error) | Self::File(FileError { source: error, .. }) => error.kind() == ErrorKind::BrokenPipe,

@@ -31,17 +31,17 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     if found.is_empty() {
         return Ok(writeln!(out, "{} has no trainings, experiments or assessments", args.dir.display())?);
     }
-    // A path with a line break would be two rows.
+    // Escape line breaks in a path, which would divide its row in two.
     let path = |found: &RunSummary| escape_terminal(&found.path.display().to_string()).into_owned();
     let done = |found: &RunSummary| {
         if found.unit.is_empty() {
-            // A run whose files are damaged has no unit.
+            // The unit is empty if the run's files are damaged. Its progress is then unknown.
             return String::new();
         }
         let number = |number: u64| grouped(number as usize);
         format!("{} of {} {}", number(found.done), number(found.budget), found.unit)
     };
-    // A table if it fits into the terminal, and otherwise two lines for each run.
+    // Print a table if it fits into the terminal, and otherwise two lines for each run.
     let table = Table::builder("", &found)
         .text("run", path)
         .text("what", |found| &found.what)
@@ -52,7 +52,7 @@ pub(super) fn run(args: &LsArgs) -> Result<()> {
     if terminal_width().is_none_or(|width| table.lines().all(|line| line.chars().count() <= width)) {
         return Ok(writeln!(out, "{table}\n{SUCCESS_NOTE}")?);
     }
-    // The terminal would wrap a table that is wider than itself.
+    // The table is too wide: the terminal would wrap its lines.
     for found in &found {
         let success = found.success_percent.map(|percent| format!("success {percent:.1} %"));
         let words = [found.what.clone(), done(found), success.unwrap_or_default(), found.state.to_owned()];

@@ -139,7 +139,7 @@ fn servers(args: &ServerArgs, stop: &StopFlag) -> Result<Servers> {
     Ok(servers)
 }
 
-/// Returns [`servers`] to which the learner reconnects after a loss, for as long as `wait` permits.
+/// Returns [`servers`]. If a server is lost, the learner tries to reconnect for as long as `wait` permits.
 fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs, stop: &StopFlag) -> Result<Servers> {
     Ok(servers(args, stop)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }

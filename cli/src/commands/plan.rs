@@ -58,7 +58,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     let groups_shown = groups_line(&groups, grouping);
     let grouping = Grouping { at_a_time: grouping.at_a_time.min(groups.len()), ..grouping };
     let (_private, addresses) = servers_of_jobs(&with_tasks_of(&args.server, &plan)?, grouping.at_a_time, &stop)?;
-    // The run itself reports servers that do not answer.
+    // Ignore servers that do not answer. `perturb run` will report them.
     let (servers, _) = Servers::connect_to_some(&addresses, &stop)?;
     let limits = step_limits(&servers, &known)?;
     // Print the numbers of configurations, trainings and tests.
@@ -97,8 +97,8 @@ fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> S
     format!("{cells} in {number} of {sizes_shown}, {} at a time", at_a_time.min(groups.len()))
 }
 
-/// Estimates and prints how long the plan takes. Durations come from finished cells of the same kind if there are any,
-/// and otherwise from measurements, which give an upper bound.
+/// Estimates and prints how long the plan takes. A cell's duration is taken from finished cells of the same environment
+/// and method. Without such cells it is measured, which gives an upper bound.
 fn estimate(
     args: &PlanArgs,
     plan: &Plan,
@@ -108,7 +108,7 @@ fn estimate(
     stop: &StopFlag,
 ) -> Result<()> {
     let mut out = output();
-    // The durations of some cells are known from finished cells of the same kind.
+    // Sum the durations that are known from finished cells of the same environment and method.
     let measured_seconds = |cell: &Cell| finished.and_then(|(_, timings)| timings.seconds(cell));
     let (known, unknown): (Vec<usize>, Vec<usize>) =
         (0..plan.cells.len()).partition(|&cell| measured_seconds(&plan.cells[cell]).is_some());
@@ -127,7 +127,7 @@ fn estimate(
     if args.measure == 0 && finished.is_some() && !unknown.is_empty() {
         writeln!(out, "not measured: {}", cells(unknown.len()))?;
     }
-    // The durations of the other cells are measured.
+    // Measure the durations of all other cells.
     if args.measure > 0 && !unknown.is_empty() {
         let measurements = measurements(args, plan, grouping, &unknown, servers, stop, &mut out)?;
         let estimates = estimates(plan, &measurements, limits);

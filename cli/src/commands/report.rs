@@ -65,7 +65,7 @@ fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     };
     let mut out = folder.path().join("report");
     if let Some(rule) = sources.another_rule()? {
-        // The report by the plan's own rule is not replaced.
+        // Use a folder for each other selection rule, so that the report by the plan's own rule is not replaced.
         out = out.join(rule.to_string());
     }
     Ok(out)

@@ -58,7 +58,7 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
     let mut cells =
         args.cell.iter().map(|name| find_cell(args, &plan, name).cloned()).collect::<Result<Vec<Cell>>>()?;
     cells.sort_by_key(|cell| cell.index);
-    // A cell may be named by index and by id.
+    // Remove duplicates, because the user may name the same cell once by its index and once by its id.
     cells.dedup_by_key(|cell| cell.index);
     all_cells(args, Plan { cells, candidates: Vec::new(), ..plan }, &folder, done.as_ref(), &stop)
 }
@@ -117,7 +117,8 @@ fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCo
     Ok(ExitCode::SUCCESS)
 }
 
-/// Starts a thread that raises the stop flag when standard input is closed, i.e. when the main process has ended.
+/// Starts a thread that raises the stop flag when standard input is closed, i.e. when the process that started this
+/// worker has ended.
 fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
     let stop = stop.clone();
     let wait = move || {
@@ -138,7 +139,7 @@ fn all_cells(
     done: Option<&DoneCells<'_>>,
     stop: &StopFlag,
 ) -> Result<ExitCode> {
-    // Worker processes run the same program as this process.
+    // Workers run this process's program, so it must be `perturb-recurrent` if they will train recurrent policies.
     recurrent::prepare_for(&plan)?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
     let expected = without_done(plan.with_expected_cells(Some(&layered(folder, done)))?, done)?;
@@ -186,8 +187,8 @@ fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &Folder) -> Vec<usize> 
 
 /// Returns an upper bound of each cell's duration in seconds, for the estimate of the remaining time.
 ///
-/// Only cells of kinds that begin later are measured. All other cells have `None`, because the duration of their kind
-/// is known soon.
+/// Here the kind of a cell is its environment and method. If a kind's first cells begin at once, their durations will
+/// soon be known for all cells of the kind, so these cells have `None`. Only cells of the other kinds are measured.
 fn upper_bounds(
     args: &RunArgs,
     servers: &Servers,
@@ -211,10 +212,10 @@ fn upper_bounds(
     note(format_args!("measuring the duration of cells that begin later: {}", count(groups.len(), "group")));
     let measure = |group: Vec<&Cell>| measure(servers, &group, at_a_time, MEASURE_TIME, stop);
     let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {
-        // The run itself handles the signal.
+        // A signal ended the measurement. The run, which begins next, will see the signal and stop.
         Err(MeasureError::Stopped { .. }) => return Ok(Vec::new()),
-        // A measurement can fail because settings lead to numbers that are not finite. The cell will report that
-        // itself.
+        // A measurement can fail because settings lead to numbers that are not finite. The cell will report the error
+        // when it runs.
         Err(error) => {
             tracing::warn!("the remaining time will be estimated late: {error}");
             return Ok(Vec::new());

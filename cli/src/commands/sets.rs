@@ -16,8 +16,8 @@ use super::require_file;
 /// Name of the test set that --parameters makes.
 const PARAMETERS_SET: &str = "parameters";
 
-/// Returns the sets to test on: `versions`, and the set of --parameters or --contexts. Returns all versions if there
-/// are none.
+/// Returns the sets to test on: `versions`, and the set of --parameters or --contexts. Returns all versions if none of
+/// these is given.
 pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>> {
     let mut versions = versions.to_vec();
     versions.sort_unstable();

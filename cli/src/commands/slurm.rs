@@ -29,7 +29,7 @@ pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop
     let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
     let folder = Folder::new(&path);
     check_server_args(&args.server)?;
-    // The tasks are needed even with --server, because private servers check the plan on this machine.
+    // Task folders are needed even with --server, because a private server checks the plan on this machine.
     let ServerArgs { task, .. } = with_tasks_of(&ServerArgs { server: Vec::new(), ..args.server.clone() }, &plan)?;
     let absolute = |folder: &PathBuf| std::path::absolute(folder).map_err(system("find the absolute path of --task"));
     let tasks = task.iter().map(absolute).collect::<Result<Vec<_>>>()?;

@@ -118,7 +118,8 @@ pub fn film(
     Ok(footage)
 }
 
-/// The output of the frames. Encoding begins with the first film, because the size of frames is not known before.
+/// The output of the frames. Encoding begins with the first set's film, because only an open [`Film`] knows the size of
+/// frames.
 enum FilmOutput {
     Empty(VideoFile),
     Begun(VideoWriter),
@@ -138,7 +139,8 @@ impl FilmOutput {
     }
 }
 
-/// The request that follows a state.
+/// The request that [`Film::request_next`] has sent: a step, the start of the next episode, or nothing after the last
+/// episode.
 enum NextRequest {
     Step,
     Episode,
@@ -160,7 +162,7 @@ struct Film<'a> {
     begun: BegunEpisode,
     caption: Caption,
     caption_text: CaptionText,
-    /// Whether a picture was requested of the current state, and of the next state.
+    /// Whether a picture of the current state was requested, and whether a picture of the next state was requested.
     pictured: [bool; 2],
     /// The last picture that was received.
     last: Option<RenderedPicture>,
@@ -284,7 +286,7 @@ impl<'a> Film<'a> {
         }
         let asked = Instant::now();
         let picture = match (self.single.picture(), &self.last) {
-            // A diverged state ends its episode and cannot be drawn. The last picture is shown again.
+            // The server cannot draw a diverged state, which ends its episode. Show the last picture again.
             (Err(ClientError::Refused { code, .. }), Some(last))
                 if code == tonic::Code::FailedPrecondition && self.caption_text.ending.is_some() =>
             {
@@ -333,7 +335,8 @@ impl<'a> Film<'a> {
             success: end.success,
         });
         if !self.pictured[0] {
-            // The next request was not sent yet, so the picture is still of this state.
+            // Request a picture of the final state even if it is not due after this step. No reset was requested
+            // yet, so the server still has the state.
             self.request_picture()?;
             self.pictured[0] = true;
         }

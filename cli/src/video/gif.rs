@@ -104,7 +104,8 @@ impl Encode for GifEncoder {
 /// A film that shows every `stride`-th frame.
 struct ThinnedFilm {
     stride: u16,
-    /// Time between two shown frames, in hundredths of a second. The last frame of an episode is shown in any case.
+    /// Time between two shown frames, in hundredths of a second. The last frame of an episode is always shown, even if
+    /// less time has passed.
     interval: u64,
     /// Duration of a normal frame, in hundredths of a second. The last frame of an episode is shown longer.
     frame_delay: u16,

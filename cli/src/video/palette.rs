@@ -19,8 +19,8 @@ type PixelColour = [u8; 3];
 /// A palette of up to 255 colours. It maps every colour to its nearest colour in the palette.
 pub(super) struct Palette {
     colours: Vec<PixelColour>,
-    /// The palette index of each colour that was looked up before; 0 for all others. Positions are the 24 bits of a
-    /// colour. Zeros that were never written take no memory.
+    /// The palette index of each of the 2²⁴ colours, at the position red · 2¹⁶ + green · 2⁸ + blue; 0 for a colour that
+    /// was not looked up yet. Most entries are never written, so the operating system gives them no memory.
     met: Vec<u8>,
 }
 

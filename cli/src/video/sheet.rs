@@ -51,7 +51,7 @@ pub(super) struct SheetEncoder {
     pixels: Vec<u8>,
     /// Number of finished episodes.
     done: usize,
-    /// Frames of the current episode in memory: every `stride`-th one.
+    /// Every `stride`-th frame of the current episode.
     kept: Vec<Vec<u8>>,
     stride: usize,
     /// Number of frames of the current episode so far.

@@ -17,12 +17,12 @@ use super::{JsonArgs, OneOf, PlayArgs, SetArgs, at_least_one, natural};
   perturb compare saved/a saved/b --score return     # folders of Assessment.save, or --records of perturb evaluate
   perturb compare results.parquet/classic-ff --by algorithm --where environment=CartPole trained_on=R seed=2..6")]
 pub struct CompareArgs {
-    /// Conditions, each with one policy for each training seed. A PATH is the --out folder of a training, which is
-    /// tested now; or recorded tests, i.e. a cell of an experiment, a --records file of `perturb evaluate`, or a folder
-    /// that `Assessment.save` wrote in Python; or a folder that contains several of these. NAME is by default the name
-    /// of the first PATH. The policies of two conditions are compared in pairs: trainings by their seeds, recorded
-    /// tests by their order. A PATH may also be FILE.parquet or FILE.parquet/STUDY of `perturb export`: the rows that
-    /// --where chooses, divided by --by into several conditions.
+    /// Conditions, each with one policy for each training seed. A PATH is the --out folder of a training, which this
+    /// command tests, or a path of recorded tests: a cell of an experiment, a --records file of `perturb evaluate`, or
+    /// a folder that `Assessment.save` wrote in Python. It may also be a folder that contains several of these. NAME is
+    /// by default the name of the first PATH. The policies of two conditions are compared in pairs: trainings with the
+    /// same seed, or recorded tests in the order of their paths. A PATH may also be FILE.parquet or FILE.parquet/STUDY
+    /// of `perturb export`: --where selects rows of the table, and --by divides them into several conditions.
     #[arg(value_name = "[NAME=]PATH[,PATH]", required = true)]
     pub conditions: Vec<String>,
     /// Score to compare: success rates, returns, or lengths of episodes in steps.
@@ -35,7 +35,7 @@ pub struct CompareArgs {
     /// without recorded tests; none with --parameters or --contexts].
     #[arg(long, value_delimiter = ',')]
     pub versions: Vec<Version>,
-    /// The rows of results tables that are compared: those with one of these values of a column or setting, such as
+    /// Compare only the rows of results tables that have one of these values in a column or setting, e.g.
     /// algorithm=a2c,ppo or seed=2..6.
     #[arg(long = "where", value_name = "COLUMN=VALUES", num_args = 1..)]
     pub filters: Vec<RowFilter>,

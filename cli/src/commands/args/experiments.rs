@@ -28,8 +28,8 @@ pub struct PlanArgs {
     /// Seconds of measurement for each group of trainings; 0 measures nothing.
     #[arg(long, value_name = "SECONDS", default_value_t = 3, value_parser = natural::<u64>)]
     pub measure: u64,
-    /// Estimate from the durations of the finished cells in this folder, e.g. of a random tenth. They apply to cells
-    /// with the same environment and method. All other cells are measured.
+    /// Estimate from the durations of the finished cells in this folder, e.g. of a random tenth of all cells. A
+    /// duration applies to cells with the same environment and method. All other cells are measured.
     #[arg(long, value_name = "DIR")]
     pub timings_from: Option<PathBuf>,
     /// Value of --jobs for the planned run [default: one for each core].
@@ -60,8 +60,8 @@ pub struct RunArgs {
     /// architecture. 1 runs each cell by itself. Results do not depend on this number.
     #[arg(long, value_name = "N", default_value_t = Grouping::USUAL, value_parser = at_least_one::<usize>)]
     pub group: usize,
-    /// Skip the cells that this table of `perturb export` has with the same settings and tests. The selection of
-    /// configurations uses their results.
+    /// Skip cells whose results with the same settings and tests are in this table of `perturb export`. The selection
+    /// of configurations uses the results in the table.
     #[arg(long, value_name = "FILE")]
     pub done: Option<PathBuf>,
     /// Run failed cells again.
@@ -76,7 +76,8 @@ pub struct RunArgs {
     /// Write the events of each cell to this file as JSON lines. `-` or no name prints them.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", conflicts_with = "engine")]
     pub json: Option<PathBuf>,
-    /// Run the cells that a line of standard input names. Stop when standard input is closed.
+    /// Read one line with the names of cells from standard input, and run these cells. Stop when standard input is
+    /// closed.
     #[arg(long, hide = true, requires = "server",
         conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html", "done"])]
     pub worker: bool,
@@ -104,8 +105,8 @@ pub struct EngineArgs {
     /// Maximum number of jobs that run at the same time [default: no limit].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<u32>)]
     pub array_limit: Option<u32>,
-    /// Number of cells in a job. They have the same environment and architecture [default: the number that takes some
-    /// minutes].
+    /// Number of cells in a job. They have the same environment and architecture [default: as many as a job finishes in
+    /// some minutes].
     #[arg(long, value_name = "N", requires = "engine", value_parser = at_least_one::<usize>)]
     pub cells_per_job: Option<usize>,
 }
@@ -135,7 +136,7 @@ pub struct ExportArgs {
     /// Also write the whole table to this file as CSV. `-` or no name prints it and nothing else.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub csv: Option<PathBuf>,
-    /// Also write the policies that DIR has to policies/ID.safetensors beside FILE, and their test episodes to
+    /// Also copy the policies in DIR: their weights to policies/ID.safetensors beside FILE, and their test episodes to
     /// episodes/STUDY.parquet.
     #[arg(long)]
     pub policies: bool,

@@ -58,8 +58,8 @@ impl Cli {
         Self::from_arg_matches(&matches).unwrap_or_else(|error| error.exit())
     }
 
-    /// Returns the parser. It takes a negative number as the value of the option before it, so that the option's own
-    /// error message is shown.
+    /// Returns the parser. It takes a negative number after an option as the option's value and not as another option,
+    /// so that the error message is about the value.
     pub fn parser() -> clap::Command {
         let with_negative = |arg: Arg| match arg.get_action().takes_values() {
             true => arg.allow_negative_numbers(true),
@@ -131,8 +131,8 @@ pub struct ServerArgs {
     /// servers; 1 in a Slurm job].
     #[arg(long, value_name = "N", value_parser = |text: &str| within(text, 1..=MAX_WORKERS))]
     pub workers: Option<usize>,
-    /// Folder of a task with an MJCF model and a file task.toml, which private servers then also serve. Can be given
-    /// several times. A running server serves the folders of its own --task.
+    /// Folder of a task: an MJCF model and a file task.toml. Private servers then serve the task as an environment. Can
+    /// be given several times. A running server of --server needs its own option --task.
     #[arg(long, value_name = "DIR")]
     pub task: Vec<PathBuf>,
 }

@@ -143,8 +143,8 @@ pub struct RescoreArgs {
   perturb heatmap --checkpoint runs/on-d runs/on-r --out d-and-r
   perturb heatmap runs/quick")]
 pub struct HeatmapArgs {
-    /// The --out folder of `perturb run`: tests every policy that was selected in one of its runs. The results go to
-    /// its folder heatmaps/, and existing ones are kept. Pictures of the means over runs go to report/.
+    /// The --out folder of `perturb run`. Every policy that was selected in one of its runs is tested. The results go
+    /// to DIR/heatmaps/, and existing results are kept. Pictures of the means over runs go to DIR/report/.
     #[arg(
         value_name = "DIR",
         required_unless_present = "checkpoint",

@@ -55,7 +55,8 @@ pub(super) fn table_of(path: &Path) -> Result<Option<(PathBuf, Option<String>)>>
     Ok(Some((table, Some(cell))))
 }
 
-/// Returns the stored policies that the table at `path` has checksums of: all, or the policy of `cell`.
+/// Returns the stored policies whose tests have checksums in the table at `path`. If `cell` is given, returns only the
+/// policy of this cell.
 pub(super) fn stored_policies(path: &Path, cell: Option<&str>) -> Result<Vec<ChecksummedPolicy>> {
     let table = ResultsTable::read(path)?;
     let beside = path.parent().unwrap_or(Path::new(""));
@@ -66,7 +67,7 @@ pub(super) fn stored_policies(path: &Path, cell: Option<&str>) -> Result<Vec<Che
         for known in plan.cells.iter().chain(&plan.candidates).filter(|known| cell.is_none_or(|id| known.id == id)) {
             let checkpoint = beside.join(POLICIES).join(format!("{}.safetensors", known.id));
             let rows = results.rows(&known.id);
-            // Intermediate policies are not stored.
+            // Keep only the tests of the final policy. A table's folder has no policies of intermediate evaluations.
             let last = rows.last().and_then(|row| row.after_episodes);
             let sum = |row: &&TableRow| Some((row.tested_on.clone()?, row.checksum.clone()?));
             let of_final = rows.iter().filter(|row| row.after_episodes == last);
@@ -118,8 +119,8 @@ impl ChecksummedPolicy {
         self.compare(&replayed)
     }
 
-    /// Compares the checksums of `replayed` with those of the table. If the recorded episodes are stored, too, the
-    /// result names the first episode that differs.
+    /// Compares the checksums of `replayed` with the checksums in the table. If the file with the recorded episodes
+    /// exists, the result names the first episode that differs.
     fn compare(&self, replayed: &Records) -> Result<Audit> {
         let mut audit = Audit { episodes: replayed.episodes.len() as u64, different: Vec::new() };
         let mut recorded = None;

@@ -23,11 +23,11 @@ use crate::commands::{plan_in, playing_servers, refuse_file, require_default_out
 /// Counts for the command's exit status.
 #[derive(Default)]
 struct HeatmapCounts {
-    /// Number of heatmaps of finished cells whose environment has both parameters.
+    /// Number of heatmaps to make: one for each selected policy whose environment has the parameters of both axes.
     total: usize,
     /// Number of these heatmaps that could not be made.
     failed: usize,
-    /// Number of environments that lack one of the parameters.
+    /// Number of environments that lack the parameter of an axis.
     skipped_environments: usize,
 }
 
@@ -46,7 +46,8 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
             directory.join("report")
         }
     };
-    // A place is a heatmap of the experiment: the policy that was selected for an environment and method in a run.
+    // A `HeatmapPlace` is a heatmap of the experiment. It belongs to an environment, a method and a run, and shows the
+    // policy that was selected for them.
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);

@@ -52,7 +52,7 @@ pub(super) fn resume_run(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     let report = |progress: &Progress| display.training(progress);
     let outcome = resume(&servers, &directory, (checkpoint, state), threads(args.threads), &stop, report);
     drop(display);
-    // config.toml gets the larger budget only once a checkpoint has it.
+    // Write the larger budget to config.toml only if the run has saved a checkpoint with it, so that both files agree.
     let saved = args.extend.and_then(|_| Checkpoint::load(path).ok());
     if saved.is_some_and(|saved| saved.state.config == config) {
         write_atomically(&path.join("config.toml"), config.to_toml().as_bytes())?;
@@ -60,8 +60,8 @@ pub(super) fn resume_run(args: &TrainArgs, path: &Path) -> Result<ExitCode> {
     finish(args, &config, &directory, outcome)
 }
 
-/// Returns the new budget: `more` episodes in addition to the old budget, or to the `trained` episodes if these are
-/// more. The last iteration of a training may exceed its budget.
+/// Returns the new budget: `more` episodes in addition to the old `budget` or to the `trained` episodes, whichever is
+/// larger. The number of trained episodes may be larger, because a training finishes its last iteration.
 fn extended_budget(budget: u64, trained: u64, more: u64) -> u64 {
     budget.max(trained).saturating_add(more).min(MAX_EPISODES)
 }
