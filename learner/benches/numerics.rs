@@ -1,7 +1,8 @@
 //! Measures the time of choosing actions and of updates. Run it with `cargo bench -p perturb-learner --bench numerics
 //! [filter]`.
 //!
-//! Each line of the output has the fastest and the median repetition. The result of each timed call is checked.
+//! Each line of the output has the times of the fastest and of the median repetition, in µs. The result of each timed
+//! call is checked.
 
 use std::time::Instant;
 
@@ -42,7 +43,8 @@ fn observations(size: usize) -> Vec<f32> {
     (0..size).map(|_| normal(&mut rng) as f32).collect()
 }
 
-/// Returns a rollout of actions that the policy chose for random observations.
+/// Returns a full rollout of `n_steps` steps in `n_envs` environments: random observations, and the actions that
+/// `policy` chose for them.
 fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     let spec = policy.spec();
     let mut actor = Actor::new(spec, n_envs);
@@ -70,7 +72,8 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
     rollout
 }
 
-/// Measures acting, loading and updates of a recurrent policy of the paper's size.
+/// Measures the times of choosing actions, loading weights and updating for a recurrent policy with the paper's layer
+/// sizes.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
     perturb_torch::register();
     let mut policy = Policy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");

@@ -31,7 +31,7 @@ pub enum Error {
     /// The described episode does not lie within the rollout.
     #[error(
         "an episode of {length} steps that ends before step {end} of environment {environment} is not in a rollout of \
-         {n_steps} steps of {n_envs} environments; one has at least one step"
+         {n_steps} steps of {n_envs} environments; an episode has at least one step"
     )]
     Episode {
         /// The environment, from 0.

@@ -17,7 +17,8 @@ use crate::training::{RunDirectory, RunDirectoryError, TrainError, train};
 
 /// Episode budget of a measured training, so large that the training never ends by itself.
 const UNLIMITED_EPISODES: u64 = 1 << 40;
-/// Number of reports by which another cell may be ahead of the leader. Beyond it, the leader counts as failed.
+/// Maximum number of reports by which another cell may be ahead of the leader, see [`SpeedMeter`]. If it is further
+/// ahead, the leader counts as failed.
 const MAX_MISSED_UPDATES: u64 = 100;
 /// Number of test episodes. Each is played in a separate environment.
 const TEST_EPISODES: u64 = 100;
@@ -60,10 +61,11 @@ pub enum MeasureError {
     },
 }
 
-/// Measures the time per step of training and of tests. Trains the cells of `group`, at least one, together, as an
-/// experiment does, for about `limit` and at least two iterations; then tests one of the policies. Does this in `jobs`
-/// threads at the same time and averages over them, because parallel jobs slow each other down. Deletes the policies at
-/// the end.
+/// Measures the time per step of training and of tests.
+///
+/// Trains the cells of `group` together, as an experiment does, for about `limit` and at least two iterations. `group`
+/// must not be empty. Then tests one of the policies. Does this in `jobs` threads at the same time and averages the
+/// results, because parallel jobs slow each other down. Deletes the policies at the end.
 ///
 /// # Errors
 /// [`MeasureError`] if a training or test fails, and [`MeasureError::Stopped`] soon after `stop` is raised.
@@ -98,7 +100,8 @@ pub fn measure(
     })
 }
 
-/// Measures one job: trains the group in the folder `scratch`, then tests one policy. The random policy is only tested.
+/// Measures one job: trains the group in the folder `scratch`, then tests one policy. A random policy needs no training
+/// and is only tested.
 fn measure_one(
     servers: &Servers,
     group: &[&Cell],
@@ -134,14 +137,16 @@ fn measure_one(
     Ok(Speed { training, testing: measure_test(servers, cell, &checkpoint, stop)? })
 }
 
-/// Measures the time from the first to the last report of the leader, and counts the steps of all cells in this time.
-/// The leader is the cell that reports first. The cells of a group update in turn, so each other cell has one update
+/// Measures the training speed of a group of cells from the cells' progress reports.
+///
+/// The leader is the cell that reports first. The meter takes the time from the leader's first to its last report, and
+/// counts the steps of all cells in this time. The cells of a group update in turn, so each other cell has one update
 /// between two reports of the leader.
 struct SpeedMeter {
     start: Instant,
     timesteps: HashMap<String, u64>,
     /// Number of reports by cell id.
-    heard: HashMap<String, u64>,
+    reports: HashMap<String, u64>,
     leader: Option<String>,
     /// Time of the leader's first report, and the sum of all steps that were reported before it.
     first: Option<(Duration, u64)>,
@@ -153,8 +158,8 @@ struct SpeedMeter {
 impl SpeedMeter {
     fn new() -> Self {
         let timesteps = HashMap::new();
-        let heard = HashMap::new();
-        Self { start: Instant::now(), timesteps, heard, leader: None, first: None, last: None, ended: None }
+        let reports = HashMap::new();
+        Self { start: Instant::now(), timesteps, reports, leader: None, first: None, last: None, ended: None }
     }
 
     /// Processes an event of the cell `id`. Returns the time since the meter started, or zero before the leader's
@@ -163,18 +168,18 @@ impl SpeedMeter {
         let now = self.start.elapsed();
         match event {
             CellEvent::Training { timesteps, .. } if timesteps > 0 => {
-                *self.heard.entry(id.to_owned()).or_default() += 1;
+                *self.reports.entry(id.to_owned()).or_default() += 1;
                 let silent =
-                    |leader: &String| self.heard[id] > self.heard.get(leader).unwrap_or(&0) + MAX_MISSED_UPDATES;
+                    |leader: &String| self.reports[id] > self.reports.get(leader).unwrap_or(&0) + MAX_MISSED_UPDATES;
                 if self.leader.as_ref().is_some_and(silent) {
                     (self.leader, self.first, self.last) = (None, None, None); // the leader has failed; its error is reported at the end
                 }
                 let leads = self.leader.get_or_insert_with(|| id.to_owned()) == id;
                 // A training repeats its last report at its end. The repetition is ignored.
                 if leads && self.timesteps.get(id).is_none_or(|&known| known < timesteps) {
-                    let told = (now, self.timesteps.values().sum());
-                    self.first.get_or_insert(told);
-                    self.last = Some(told);
+                    let point = (now, self.timesteps.values().sum());
+                    self.first.get_or_insert(point);
+                    self.last = Some(point);
                 }
                 match self.timesteps.get_mut(id) {
                     Some(known) => *known = timesteps,
@@ -213,7 +218,8 @@ fn measure_test(servers: &Servers, cell: &Cell, checkpoint: &Checkpoint, stop: &
     let start = Instant::now();
     let records = Tester::new(servers, checkpoint, options)?.test(sets, stop, &mut |_, _| {})?;
     let seconds = start.elapsed().as_secs_f64();
-    // Each environment plays one episode (or trial), and all environments are stepped until the longest has ended.
+    // Each environment plays one episode (or trial). All environments are stepped until the longest episode has ended,
+    // so the number of steps is the longest length times the number of environments.
     let mut lengths: BTreeMap<u32, u64> = BTreeMap::new();
     for episode in &records.episodes {
         *lengths.entry(episode.environment_index).or_default() += u64::from(episode.length);

@@ -13,7 +13,8 @@ use perturb_settings::{Method, TrainConfig, Wrapper};
 
 use crate::plan::{Cell, Grouping, Plan, distinct};
 
-/// Process time per environment step, in seconds. It includes the time of the policy.
+/// Wall-clock seconds of one process per environment step, including the time of the policy. The steps of all cells
+/// that the process runs together count.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
     /// Time per step in training, with rollouts and updates.
@@ -36,7 +37,7 @@ pub struct Measurement {
 }
 
 /// Upper bound of the cost of one or more cells. It assumes that every episode lasts until the step limit. Seconds are
-/// process time.
+/// wall-clock time of one process; cells that run together in a process share its time.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Estimate {
     /// Steps of training, including episodes that EPOpt generates but does not learn from.
@@ -136,8 +137,8 @@ pub fn tested_episodes(cell: &Cell) -> f64 {
     trials * f64::from(cell.config.settings.episodes_per_trial())
 }
 
-/// Returns the speed of a pair of environment and method. For an unmeasured pair, it is the method's time per step in
-/// another environment plus the additional time that this environment takes.
+/// Returns the speed of a pair of environment and method. If the pair was not measured, adds the additional time of
+/// this environment to the method's time per step in another environment.
 fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
     let find = |environment: &str, method: &Method| {
         measurements.iter().find(|known| known.environment == environment && known.method == *method)

@@ -99,7 +99,7 @@ struct MonitorEpisode {
 impl Curve {
     /// Computes the curve of a method from the episodes of its runs.
     fn from_runs(method: &Method, version: Version, runs: &[Vec<MonitorEpisode>]) -> Self {
-        Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|footing| line(runs, footing)) }
+        Self { method: method.clone(), version, lines: BudgetAxis::ALL.map(|axis| line(runs, axis)) }
     }
 
     /// Returns the points of the curve over the axis `by`, in order of progress.
@@ -182,16 +182,16 @@ fn parse_monitor(content: &[u8]) -> Result<Vec<MonitorEpisode>, AnyError> {
     Ok(episodes)
 }
 
-/// Computes a curve: divides each run into equal parts along the axis `footing`, and averages each part over runs.
+/// Computes a curve: divides each run into equal parts along the axis `axis`, and averages each part over runs.
 /// Parts are fractions of a run's own length, because runs end a few episodes after their budget and so differ in
 /// length. A part that contains no episode's middle has no point.
-fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
+fn line(runs: &[Vec<MonitorEpisode>], axis: BudgetAxis) -> AxisCurve {
     let shortest = runs.iter().map(Vec::len).min().unwrap_or_default();
     let count = (shortest / MIN_EPISODES_PER_POINT).clamp(usize::from(shortest > 0), MAX_POINTS);
-    let totals: Vec<f64> = runs.iter().map(|run| run.iter().map(|episode| footing.weight(episode)).sum()).collect();
+    let totals: Vec<f64> = runs.iter().map(|run| run.iter().map(|episode| axis.weight(episode)).sum()).collect();
     let total = Summary::from_values(&totals).map_or(0.0, |total| total.mean);
     let parts: Vec<Vec<&[MonitorEpisode]>> =
-        runs.iter().zip(&totals).map(|(run, total)| split(run, count, *total, footing)).collect();
+        runs.iter().zip(&totals).map(|(run, total)| split(run, count, *total, axis)).collect();
     let point = |part: usize| {
         let over_runs = |number: fn(&MonitorEpisode) -> f64| {
             let there = parts.iter().map(|run| run[part]).filter(|part| !part.is_empty());
@@ -206,13 +206,13 @@ fn line(runs: &[Vec<MonitorEpisode>], footing: BudgetAxis) -> AxisCurve {
     AxisCurve { total, points: (0..count).filter_map(point).collect() }
 }
 
-/// Divides the episodes of `run` into `count` parts of equal length along the axis `footing`. `total` is the length of
+/// Divides the episodes of `run` into `count` parts of equal length along the axis `axis`. `total` is the length of
 /// the run on this axis. An episode belongs to the part that contains its middle.
-fn split(run: &[MonitorEpisode], count: usize, total: f64, footing: BudgetAxis) -> Vec<&[MonitorEpisode]> {
+fn split(run: &[MonitorEpisode], count: usize, total: f64, axis: BudgetAxis) -> Vec<&[MonitorEpisode]> {
     let mut before = 0.0;
     let mut part_of = Vec::with_capacity(run.len());
     for episode in run {
-        let own = footing.weight(episode);
+        let own = axis.weight(episode);
         part_of.push(((before + own / 2.0) / total * count as f64) as usize);
         before += own;
     }

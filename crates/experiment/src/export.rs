@@ -57,7 +57,7 @@ pub fn export(
         Ok(())
     };
     let mut planned = HashSet::new();
-    // A selected candidate is in both lists.
+    // A selected candidate is in both lists, but its rows are added only once.
     for cell in plan.cells.iter().chain(&plan.candidates) {
         if planned.insert(cell.id.as_str()) {
             add(&cell.id, Some(cell))?;
@@ -129,7 +129,7 @@ fn add_done(
     Ok(records)
 }
 
-/// Returns the row of a failed cell, whose `failure` the caller fills in.
+/// Returns the row of a failed cell, in which the caller fills in the column `failure`.
 fn failed_row(study: &str, cell: &Cell) -> TableRow {
     let common = &cell.config.common;
     let (trained_on, run) = (cell.trained_on().to_string(), (cell.run, common.seed));

@@ -36,7 +36,8 @@ fn external_agents_follow_their_environment_as_rows() {
     assert_eq!(selections[1].metric(perturb_records::Metric::Default), [(1, 100.0), (2, 50.0)].into());
 }
 
-/// Assessments, and expected runs, are separated by commas. Each letter is the training distribution of a policy.
+/// The first argument lists assessments, and the second one lists the expected runs, both separated by commas. Each
+/// letter is the training distribution of a policy.
 #[rstest]
 #[case("D,DRE", "D,DRE")]
 #[case("DR,RE", "DR,RE")]

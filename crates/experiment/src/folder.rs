@@ -403,14 +403,14 @@ impl CellFolder {
         files::delete(&path)
     }
 
-    /// Deletes the failure record if it is still the one identified by `mark`. Returns false, and deletes nothing, if
-    /// another process has locked the cell.
+    /// Deletes the failure record if its identity is still `expected`. Returns false, and deletes nothing, if another
+    /// process has locked the cell.
     ///
     /// # Errors
     /// [`FileError`] if the files cannot be deleted.
-    pub fn clear_failure_if(&self, mark: FailureId) -> files::Result<bool> {
+    pub fn clear_failure_if(&self, expected: FailureId) -> files::Result<bool> {
         let lock = self.try_lock()?;
-        if lock.is_some() && self.failure_id() == Some(mark) {
+        if lock.is_some() && self.failure_id() == Some(expected) {
             self.clear_failure()?;
         }
         Ok(lock.is_some())

@@ -41,8 +41,8 @@ pub struct MethodResults<'a> {
     /// Number of cells of this method and environment, including cells that will be trained after the selection. Cells
     /// that are trained on parameter sets of the plan do not count.
     pub cells: usize,
-    /// Number of cells, counted in the same way, that have a result. If it is below `cells`, the selection is among
-    /// fewer configurations than the plan has.
+    /// Number of these cells that have a result. If it is below `cells`, the selection is among fewer configurations
+    /// than the plan has.
     pub done: usize,
     /// The selected policies of each run, by the run's number, from 1.
     pub runs: BTreeMap<u32, SelectedRun<'a>>,
@@ -164,8 +164,8 @@ impl<'a> Results<'a> {
 }
 
 impl<'a> MethodResults<'a> {
-    /// Counts a tuning cell. The first tuning cell of a training distribution also adds the `runs` cells that will be
-    /// trained after the selection.
+    /// Counts a tuning cell. The first tuning cell of a training distribution also adds `runs` to the number of cells,
+    /// because so many cells will be trained after the selection.
     fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
         let is_papers = usize::from(cell.set.is_none());
         self.cells += is_papers;
@@ -243,8 +243,8 @@ impl<'a> SelectedRun<'a> {
         self.trained_on(trained_on).into_iter().chain(tied).collect()
     }
 
-    /// Returns a number of a test, averaged over tied configurations. Returns `None` if one of them has no test on
-    /// `tested_on`.
+    /// Returns a number of a test, averaged over tied configurations. Returns `None` if one of the configurations has
+    /// no test on `tested_on`.
     fn mean_over_ties(
         &self,
         trained_on: TrainedOn<'_>,
@@ -291,8 +291,8 @@ impl<'a> SelectedRun<'a> {
         self.trained_on(trained_on)?.cell()
     }
 
-    /// Returns the success rate in a scenario, %, averaged over tied configurations. Returns `None` if one of them has
-    /// no test.
+    /// Returns the success rate in a scenario, %, averaged over tied configurations. Returns `None` if one of the
+    /// configurations has no such test.
     pub fn rate(&self, Scenario { train, test }: Scenario) -> Option<f64> {
         self.mean_over_ties(TrainedOn::Version(train), &test.to_string(), |test| test.success_percent)
     }

@@ -17,10 +17,10 @@ fn plan() -> Plan {
 
 /// A function that returns success rates on D, R and E, and a mean return. Its arguments are the environment, the
 /// training version, the configuration ("A" or "B") and the run.
-type PolicyMetadata<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
+type RatesFn<'f> = &'f dyn Fn(&str, Version, &str, u32) -> Option<([f64; 3], f64)>;
 
 /// Returns the results of the cells for which `rates` returns numbers. All other cells are missing.
-fn results<'a>(plan: &'a Plan, rates: PolicyMetadata<'_>) -> Results<'a> {
+fn results<'a>(plan: &'a Plan, rates: RatesFn<'_>) -> Results<'a> {
     fixture::results(plan, |cell| {
         let common = &cell.config.common;
         rates(&common.environment, common.version, if is_a(cell) { "A" } else { "B" }, cell.run)
@@ -129,7 +129,7 @@ fn return_breaks_ties_and_the_rest_is_averaged() {
     let plan = plan();
     // The rates on R show whether A or B was selected.
     let on_r = |name: &str| [100.0, if name == "A" { 1.0 } else { 2.0 }, 0.0];
-    let chosen = |rates: PolicyMetadata<'_>| {
+    let chosen = |rates: RatesFn<'_>| {
         let results = results(&plan, rates);
         let selections = results.select();
         [1, 2].map(|run| selections[0].runs[&run].rate(Scenario { train: Version::D, test: Version::R }))

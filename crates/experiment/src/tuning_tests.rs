@@ -34,11 +34,11 @@ fn is_a(cell: &Cell) -> bool {
 
 /// A function that returns the success rate and the mean return in selection tests. Its arguments are the configuration
 /// ("A" or "B") and the seed. In ordinary tests, the order of A and B is reversed.
-type PolicyMetadata = fn(&str, u64) -> Option<(f64, f64)>;
+type SelectionResultFn = fn(&str, u64) -> Option<(f64, f64)>;
 
 /// Writes the results that `known` returns. Cells for which it returns `None` have failed if `failed` is set, and are
 /// missing otherwise.
-fn done(plan: &Plan, folder: &Folder, known: PolicyMetadata, failed: bool) {
+fn done(plan: &Plan, folder: &Folder, known: SelectionResultFn, failed: bool) {
     for cell in &plan.cells {
         let place = folder.cell(&cell.id);
         match known(if is_a(cell) { "A" } else { "B" }, cell.config.common.seed) {
@@ -119,7 +119,7 @@ fn cell_id_without_selection_matches_the_papers_rule() {
 #[case::then_the_return(|name: &str, seed: u64| Some((if seed == 4 { 90.0 } else { 10.0 }, if name == "B" { 2.0 } else { 1.0 })), "B", 2)]
 #[case::then_the_plan(|_: &str, _: u64| Some((50.0, 1.0)), "A", 2)]
 #[case::of_what_has_not_failed(|name: &str, seed: u64| (name == "B" && seed == 5).then_some((0.0, -9.0)), "B", 1)]
-fn selection_episodes_select(#[case] known: PolicyMetadata, #[case] expected: &str, #[case] seeds: usize) {
+fn selection_episodes_select(#[case] known: SelectionResultFn, #[case] expected: &str, #[case] seeds: usize) {
     let (plan, (_directory, folder)) = (plan(), place());
     done(&plan, &folder, known, true);
     let chosen = plan.with_selected_cells(&folder).unwrap();
@@ -161,7 +161,7 @@ fn selection_waits_for_all_tuning_cells() {
 #[test]
 fn reported_cells_depend_on_the_rule() {
     let (plan, (_directory, folder)) = (plan(), place());
-    let known: PolicyMetadata = |name, seed| Some((if name == "A" { 60.0 } else { 50.0 } + seed as f64, 1.0));
+    let known: SelectionResultFn = |name, seed| Some((if name == "A" { 60.0 } else { 50.0 } + seed as f64, 1.0));
     done(&plan, &folder, known, false);
     let waiting = plan.with_selected_cells(&folder).unwrap();
     let results = Results::read(&waiting, &folder).unwrap();

@@ -1,8 +1,8 @@
 //! Measures training throughput, in environment steps per second:
 //!
 //! - `alone`: one PPO training with FF on CartPole D: 8 environments × 128 steps, 10 epochs, one minibatch. It uses a
-//!   private server on a Unix socket. Actions are chosen in the server, then in the client. A third measurement adds a
-//!   network delay of 5 ms each way.
+//!   private server on a Unix socket. It is measured three times: with actions chosen in the server, with actions chosen
+//!   in the client, and with actions chosen in the server and a network delay of 5 ms each way.
 //! - `together`: 36 trainings of A2C with FF on CartPole, with the paper's one environment and 5 steps per rollout;
 //!   then 9 trainings of PPO with 128 steps per rollout. They run in two groups in this process. Each group has a
 //!   private server, as with `perturb run --jobs 2`.
@@ -24,8 +24,9 @@ const ALONE: &str = "algorithm = 'ppo'\nnum_envs = 8\nn_steps = 128\nn_epochs = 
 const ITERATIONS: u64 = 100;
 const SIGNAL: i32 = 15;
 const GROUPS: usize = 2;
-/// Duration of a measurement of groups, after a warm-up of the same duration.
+/// Duration of each `together` measurement. A warm-up of the same duration precedes it.
 const MEASURED: Duration = Duration::from_secs(5);
+/// Network delay in each direction in the measurement `alone/delayed`.
 const DELAY: Duration = Duration::from_millis(5);
 
 fn main() -> Result<()> {

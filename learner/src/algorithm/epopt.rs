@@ -86,8 +86,8 @@ impl Algorithm for Epopt {
     }
 }
 
-/// Returns the episodes whose rank is at most the `epsilon`-percentile of all `ranks`, in their original order. A rank
-/// is a return; lower is worse.
+/// Returns the episodes whose rank is at most the `epsilon`-percentile of `ranks`, in their original order. `ranks` has
+/// a raw or normalised return for each episode; a lower one is worse.
 fn worst(episodes: &[EpisodeSlice], ranks: &[f64], epsilon: f64) -> Vec<EpisodeSlice> {
     let mut sorted = ranks.to_vec();
     sorted.sort_by(f64::total_cmp);

@@ -65,8 +65,8 @@ pub struct AlgorithmState {
     pub rng: Option<ChaCha8Rng>,
 }
 
-/// Statistics of an update. Names are those of stable-baselines3. Losses and other means are over the gradient steps of
-/// the update.
+/// Statistics of an update, with stable-baselines3's names. Losses and other averaged figures are means over the
+/// gradient steps of the update.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct UpdateStats {
     /// The optimiser's step size in this update.

@@ -77,7 +77,8 @@ pub struct CellJob<'a> {
     pub cell: &'a Cell,
     /// The folder of the cell's files in the experiment's folder.
     pub folder: CellFolder,
-    /// The recorded failure that may be deleted to try again. Any other failure stays.
+    /// The recorded failure that may be deleted to run the cell again. A cell with any other recorded failure is
+    /// skipped, and its record is kept.
     pub retry: Option<FailureId>,
 }
 
@@ -120,8 +121,8 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
     if let Err(failure) = train(servers, &mut all, &places, stop, tell) {
         let left: Vec<usize> = places.iter().copied().filter(|&place| all[place].trained.is_none()).collect();
         for place in left.into_iter().take_while(|_| stop.signal().is_none()) {
-            // One faulty cell, or a server without room for all cells at once, must not stop the others. So each cell
-            // is trained alone.
+            // The joint training was interrupted. The cause may be one faulty cell, or a server without room for all
+            // cells at once. So each unfinished cell is trained again alone, unless the server was lost.
             let alone = if places.len() == 1 || failure.fault == Fault::Server {
                 Err(failure.clone())
             } else {
@@ -152,7 +153,7 @@ pub fn run_cells(servers: &Servers, jobs: &[CellJob<'_>], stop: &StopFlag, tell:
 /// Trains the cells with the indices `places` in `all` together, and stores each result in its cell.
 ///
 /// # Errors
-/// A failure that interrupted the training of all cells that had not ended.
+/// The failure that interrupted the joint training. Cells whose training had not ended then have no stored result.
 fn train(
     servers: &Servers,
     all: &mut [RunningCell<'_>],
@@ -279,7 +280,7 @@ impl<'a> RunningCell<'a> {
                 Ok(CellEvent::Done)
             }
             (Ok(None), signal) => Ok(CellEvent::Stopped { signal: signal.unwrap_or(SIGTERM) }),
-            // The signal that stops a run may have ended its servers too.
+            // A stopped run reports no failure, because the signal may have ended the run's servers too.
             (Err(_), Some(signal)) => Ok(CellEvent::Stopped { signal }),
             (Err(CellFailure { reason, fault: Fault::Server | Fault::Room }), None) => {
                 Ok(CellEvent::LostServer { reason })

@@ -56,7 +56,8 @@ pub(super) fn tested(
         let agreement = records.agreement();
         of_marks.insert(mark, IntermediateEvaluation { counters: kept.state.counters, results, agreement });
     }
-    // Tests the final policy. If configurations are selected by a separate test, it has its own episodes.
+    // Tests the final policy. If the plan selects configurations by a separate test, also plays this test, on separate
+    // episodes.
     let Some(mut records) = test(&checkpoint, sets, episodes, false, "")? else { return Ok(None) };
     if let Some((set, episodes)) = selection {
         let Some(selecting) = test(&checkpoint, &[set], episodes, true, "")? else { return Ok(None) };
@@ -91,13 +92,14 @@ pub(super) fn tested(
     }))
 }
 
-/// Returns the result of each test, by the name of its set.
+/// Returns the result of each test, by the name of its parameter set.
 fn results(records: &Records) -> BTreeMap<String, TestResult> {
     let result = |test: &RecordedTest| (test.set.name.clone(), records.result(&test.set.name, None));
     records.about.tests.iter().map(result).collect()
 }
 
-/// Returns the versions of all other programs that did a part of the training.
+/// Returns the versions in `commits`, which trained the policy, without the version of this program. If `commits` is
+/// empty, returns [`UNKNOWN`] as the only version.
 fn earlier_commits(mut commits: Vec<String>) -> Vec<String> {
     if commits.is_empty() {
         return vec![UNKNOWN.into()];

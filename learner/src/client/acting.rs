@@ -108,7 +108,8 @@ impl ServerShard {
         self.stream.mismatch::<proto::Act>(got, "arrays as the protocol describes them".into())
     }
 
-    /// Converts the ended episodes of a reply. Their slots become slots of the whole batch.
+    /// Converts this server's reply. In the ended episodes, slot numbers of the server become slot numbers of the whole
+    /// batch.
     fn played(&self, mut acted: proto::Acted) -> Result<RolloutReply, ClientError> {
         let mut ended = Vec::with_capacity(acted.ended.len());
         for proto::EndedAt { step, end, terminated, .. } in std::mem::take(&mut acted.ended) {
@@ -144,7 +145,7 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
     }
 }
 
-/// Returns a test's `policy` message for one of several servers, which has `n_envs` environments of the batch.
+/// Adapts the `policy` message of a test to one of several servers, on which `n_envs` of the batch's environments are.
 pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     let mut policy = policy.clone();
     if let Some(rewards) = &mut policy.rewards {
@@ -153,8 +154,8 @@ pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
     policy
 }
 
-/// Parses the state of a server's player. `observation_size` is the session's O. If the normaliser has fewer entries,
-/// the last entries of observations are not normalised. The error names the invalid field.
+/// Parses the state of a server's player. `observation_size` is the session's O. If the normaliser has fewer than O
+/// entries, the last entries of observations are not normalised. The error names the invalid field.
 fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
     let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {
         return Err("state or stream of actions is missing".into());

@@ -14,15 +14,16 @@ use super::servers::Servers;
 const MIN_PAUSE: Duration = Duration::from_millis(100);
 /// Maximum pause between two attempts.
 const MAX_PAUSE: Duration = Duration::from_secs(10);
-/// Time after which the run continues with the servers that answer, without the others.
+/// Time to wait for all lost servers. After that, the run continues with the servers that answer.
 const PARTIAL_RECONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
-/// Reconnects to lost servers with growing pauses, and counts the time spent waiting since the last progress.
+/// Reconnects to lost servers with growing pauses, and counts the time spent waiting since the run last made progress.
 #[derive(Debug, Default)]
 pub struct Backoff {
     waited: Duration,
     attempts: u32,
-    /// Whether the run has made any progress. The servers then had room once, so a full server may have room again.
+    /// Whether the run has made any progress. If so, the servers once had room for its environments, so a server that
+    /// is full now may have room again.
     has_begun: bool,
 }
 

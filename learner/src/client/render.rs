@@ -159,7 +159,7 @@ impl<'a> RenderSession<'a> {
         servers.wait_for(part.stream.send(request))
     }
 
-    /// Receives the reply to the oldest request without a reply, which must be an `A`.
+    /// Receives the reply to the oldest unanswered request, which must be of the type `A`.
     fn reply<A: TypedRequest>(&mut self) -> Result<A::Reply, ClientError> {
         let Self { servers, part, .. } = self;
         servers.wait_for(part.stream.receive::<A>())

@@ -19,10 +19,10 @@ use perturb_settings::Common;
 use super::options::{ActorLocation, ServerWait};
 use crate::proto;
 
-/// After a stop signal, time within which a server must answer a sign-of-life request. While it does, its reply is
-/// still awaited.
+/// Timeout of sign-of-life requests. After a stop signal, this program waits for pending replies only while every
+/// server answers these requests in time.
 const LIFE_SIGN_TIMEOUT: Duration = Duration::from_secs(1);
-/// After a stop signal, time to wait for a reply before each sign-of-life request.
+/// Pause before each sign-of-life request after a stop signal.
 const LIFE_SIGN_INTERVAL: Duration = Duration::from_millis(500);
 
 /// Connections to one or more servers that serve the same environments.
@@ -37,7 +37,7 @@ pub struct Servers {
     act: ActorLocation,
     wait: ServerWait,
     stop: StopFlag,
-    /// Set when a server did not respond after a stop signal. No call waits for servers any more.
+    /// Whether a server did not respond after a stop signal. If so, no call waits for servers any more.
     has_given_up: AtomicBool,
 }
 

@@ -99,7 +99,7 @@ impl<'a> Session<'a> {
         self.num_envs
     }
 
-    /// Returns whether the servers choose actions: this is the configured place, and all servers support it. See
+    /// Returns whether the servers choose the actions: the configuration asks for it, and all servers support it. See
     /// [`Session::play`].
     pub fn acts(&self) -> bool {
         self.acts
@@ -207,7 +207,8 @@ impl<'a> Session<'a> {
     ///
     /// # Errors
     /// [`ClientError::Snapshots`] if there are not n snapshots, [`ClientError::Refused`] for a snapshot of something
-    /// else, and connection failures. After the last two, some environments may already have been restored.
+    /// else, and connection failures. After a refusal or a connection failure, some environments may already have been
+    /// restored.
     pub fn restore(&mut self, slots: Range<usize>, snapshots: &[Bytes]) -> Result<Vec<f32>, ClientError> {
         if snapshots.len() != slots.len() {
             return Err(ClientError::Snapshots { got: snapshots.len(), expected: slots.len() });
@@ -251,7 +252,8 @@ impl<'a> Session<'a> {
         )
     }
 
-    /// Frees the environments of `slots` on the servers. The environments behind them move down to lower slots.
+    /// Frees the environments of `slots` on the servers. Environments with higher slots move down, so that no slot
+    /// stays empty.
     ///
     /// # Errors
     /// Connection failures.

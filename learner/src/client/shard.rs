@@ -21,7 +21,7 @@ pub(super) struct ServerShard {
     snapshot_bytes: usize,
     /// Buffer for encoded actions. Its memory is reused after a request has been sent.
     pub(super) actions: BytesMut,
-    /// Whether the last request to this server still needs its reply.
+    /// Whether the last request to this server is still unanswered.
     pub(super) asked: bool,
 }
 

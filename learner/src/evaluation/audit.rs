@@ -28,7 +28,7 @@ pub struct Audit {
 pub enum AuditError {
     /// The episodes were recorded with another policy.
     #[error(
-        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: give the checkpoint that was tested"
+        "the episodes were recorded with the policy {recorded}, the checkpoint is {got}: pass the checkpoint that was tested"
     )]
     Policy {
         /// The identifier of the recorded policy.

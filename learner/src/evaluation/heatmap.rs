@@ -27,7 +27,7 @@ pub enum HeatmapError {
     },
     /// The episodes were recorded with another policy.
     #[error(
-        "the episodes were recorded of the policy {recorded}, the checkpoint is {got}: pass the checkpoint these episodes \
+        "the episodes were recorded with the policy {recorded}, the checkpoint is {got}: pass the checkpoint these episodes \
          were recorded with"
     )]
     Policy {

@@ -11,8 +11,8 @@ use crate::checkpoint::Checkpoint;
 use crate::client::{EndedEpisode, RolloutReply, Session, StepReply, acting};
 use crate::proto;
 
-/// Number of steps that a request asks a server to play: few compared with a whole test, but enough to hide network
-/// latency.
+/// Number of steps of each environment that a request asks a server to play. It is small compared with a whole test,
+/// but large enough to hide network latency.
 const STEPS_PER_REQUEST: u32 = 64;
 
 /// Plays trials with actions that this process chooses.
@@ -26,7 +26,7 @@ pub(super) struct Trials<'a> {
 /// Plays trials with actions that the servers choose.
 pub(super) struct RemoteTrials<'a> {
     session: Session<'a>,
-    /// The policy's message and weights, until the first request has sent them to the servers.
+    /// The `policy` message and the weights for the first request to the servers; `None` after this request.
     policy: Option<(proto::Policy, bytes::Bytes)>,
     episodes_per_trial: u32,
 }

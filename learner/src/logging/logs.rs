@@ -77,7 +77,7 @@ impl Logs {
     /// Opens the log files in `directory`, and truncates them to these `lengths`. New lines are appended there.
     ///
     /// # Errors
-    /// [`LogError::Changed`] if a file is missing, shorter, or has no end of a line at its length; no file is changed
+    /// [`LogError::Changed`] if a file is missing, is too short, or has no line end at its length; no file is changed
     /// then. [`LogError::File`] if a file cannot be read or written.
     pub fn resume(
         directory: &Path,
@@ -127,7 +127,8 @@ impl Logs {
     }
 }
 
-/// Opens a log for appending. It must have at least `length` bytes. If `lines` is set, a line must end at this length.
+/// Opens a log for appending. The file must have at least `length` bytes. If `lines` is set, a line must end after
+/// these bytes.
 fn open(path: &Path, length: u64, lines: bool) -> Result<File, LogError> {
     let changed = |reason| Err(LogError::Changed { path: path.to_owned(), reason });
     match open_plain(path) {

@@ -21,7 +21,7 @@ pub struct EpisodeFigures {
     pub success: f64,
 }
 
-/// Seconds, or percentages, of a training's time by activity.
+/// The time of a training by activity, in seconds or in percent of the whole time.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Serialize, Deserialize)]
 pub struct TimeShares {
     /// Time spent on choosing actions.

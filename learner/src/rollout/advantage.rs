@@ -65,9 +65,9 @@ pub struct Estimates {
 }
 
 impl Trajectories<'_> {
-    /// Calls `estimate` for the steps of every environment, from the last to the first. It returns the advantage and
-    /// the return of the step. `bootstrap_truncation` decides about V' after truncated episodes, see the module's
-    /// description.
+    /// Calls `estimate` for the steps of every environment, from the last to the first. `estimate` returns the
+    /// advantage and the return of the step. `bootstrap_truncation` decides about V' after truncated episodes, see the
+    /// module's description.
     ///
     /// # Panics
     ///

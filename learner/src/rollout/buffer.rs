@@ -90,8 +90,9 @@ impl Rollout {
         }
     }
 
-    /// Starts a new rollout: removes all steps, and stores the policy's recurrent memory before the first step,
-    /// `memory` `[N, S]`. It is empty for a feed-forward policy. Keeps the allocated capacity.
+    /// Starts a new rollout: removes all steps, and stores `memory` `[N, S]`, the policy's recurrent memory before the
+    /// first step. S is the number of values per environment, 0 for a feed-forward policy. Keeps the allocated
+    /// capacity.
     pub fn begin(&mut self, memory: &[f32]) {
         self.clear();
         self.memory.extend_from_slice(memory);
@@ -356,7 +357,7 @@ impl Rollout {
         &self.starts
     }
 
-    /// Returns the policy's recurrent memory before the first step, `[N, S]`.
+    /// Returns the policy's recurrent memory before the first step, `[N, S]`, as given to [`Rollout::begin`].
     pub fn memory(&self) -> &[f32] {
         &self.memory
     }

@@ -93,7 +93,7 @@ impl Collector {
         Ok(())
     }
 
-    /// Returns whether the rollout has all its steps.
+    /// Returns whether the rollout has all its steps or complete episodes.
     pub fn is_done(&self) -> bool {
         self.remaining.is_done()
     }
@@ -131,7 +131,7 @@ impl Collector {
         Ok(())
     }
 
-    /// Finishes the rollout with the values of the last observations.
+    /// Finishes the rollout: computes and stores the values of the observations after the last step.
     ///
     /// # Errors
     /// [`CollectError::Numbers`] if a value is not finite.

@@ -202,7 +202,7 @@ impl ClientLane {
         Ok(())
     }
 
-    /// Ends the collection of a complete rollout, and returns the times that it took.
+    /// Ends the collection of a complete rollout. Returns the times that choosing actions and waiting for servers took.
     fn collected(&mut self, now: StepTimes) -> Collected {
         let begun = self.begun.take().unwrap_or(now);
         Collected { index: self.index, acting: now.acting - begun.acting, waiting: now.waiting - begun.waiting }

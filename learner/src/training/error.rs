@@ -48,7 +48,9 @@ pub enum TrainError {
     #[error(transparent)]
     File(#[from] FileError),
     /// The served environment has no action space.
-    #[error("the server does not say what actions the environment takes: are both of one version?")]
+    #[error(
+        "the server does not describe the environment's actions: do the server and this program have the same version?"
+    )]
     NoActions,
     /// An episode ran with other parameters than requested.
     #[error(

@@ -8,8 +8,8 @@
 //!
 //! Determinism: the environments have the training's seed. Initial weights, minibatches and sampled actions have
 //! separate random streams (see [`perturb_policy::random`]). Every sum is computed in a fixed order. So equal
-//! configurations give equal weights, byte for byte. The numbers of servers, workers and threads make no difference,
-//! nor does the place where actions are chosen or which trainings run together.
+//! configurations give equal weights, byte for byte. The weights do not depend on the numbers of servers, workers and
+//! threads, on the place where actions are chosen, or on which trainings run together.
 
 mod client_side;
 mod ending;
@@ -171,10 +171,10 @@ struct Run<'a> {
 }
 
 impl Run<'_> {
-    /// Returns the value of `result`. If it is an error, ends the run with it and returns `None`.
+    /// Returns the value of `result`. If `result` is an error, ends the run with this error and returns `None`.
     ///
     /// # Errors
-    /// An error of a server if the run's session `is_shared`, because it ends the other runs too.
+    /// An error of a server if the run's session `is_shared`, because such an error ends the other runs too.
     fn store_error<T>(&mut self, result: Result<T>, is_shared: bool) -> Result<Option<T>> {
         match result {
             Ok(value) => Ok(Some(value)),

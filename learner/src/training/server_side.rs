@@ -21,8 +21,8 @@ use crate::client::{ClientError, RolloutReply, Servers, Session, acting};
 use crate::proto;
 use crate::rollout::{CollectError, DecodedRollout};
 
-/// Maximum number of environment steps in one reply if several runs use the server. They take some milliseconds in a
-/// classic task, and a tenth of a second with a robot. So no run waits long for the server.
+/// Maximum number of environment steps in one reply if several runs use the server. The server plays this many steps in
+/// some milliseconds in a classic task, and in a tenth of a second with a robot. So no run waits long for the server.
 const PIECE_ENV_STEPS: usize = 4096;
 
 /// A future that receives a reply, and returns it with the run's session.

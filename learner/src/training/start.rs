@@ -55,7 +55,7 @@ pub(super) fn start_or_resume<'a>(
             resume((checkpoint, &state), directory, &environment, threads, restore)?
         }
     };
-    // The policies of earlier marks were saved when the training reached them.
+    // Keeps only the marks that the training has not reached yet. The policies of earlier marks are already saved.
     let episodes = trainer.checkpoint.state.counters.episodes;
     trainer.marks = marks.iter().copied().filter(|mark| *mark > episodes).collect();
     Ok((trainer, player))

@@ -85,10 +85,12 @@ impl Trainer<'_> {
         (&mut self.rollout, &mut self.tally)
     }
 
-    /// Returns the duration of the last update, or [`LONG_UPDATE`] before the first. It predicts the next update, for
-    /// the decision whether to keep connections alive during it: the thread for this would cost more than the shortest
-    /// updates. With EPOpt, the next update can take some ten times as long. Even then, an update below [`LONG_UPDATE`]
-    /// ends before a server drops the connection.
+    /// Returns the duration of the last update, or [`LONG_UPDATE`] before the first.
+    ///
+    /// This duration predicts the next update. It decides whether a thread keeps connections alive during that update.
+    /// For the shortest updates, the thread would cost more than the update itself. With EPOpt, the next update can
+    /// take some ten times as long as predicted. Even then, an update with a prediction below [`LONG_UPDATE`] ends
+    /// before a server drops the connection.
     pub(super) fn last_update(&self) -> Duration {
         self.last_update.unwrap_or(LONG_UPDATE)
     }
@@ -138,7 +140,7 @@ impl Trainer<'_> {
                 error => error.into(),
             })?;
         if let Some(player) = player {
-            // Loading is fast now, because the weights are in the processor's caches.
+            // Loading is fast here, because the update has left the weights in the processor's caches.
             player.load(self.policy.flat_weights()).map_err(Error::from)?;
         }
         let elapsed = start.elapsed();

@@ -223,8 +223,8 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
 
             let figures: [fn(&UpdateStats) -> f64; 4] =
                 [|it| it.entropy_loss, |it| it.value_loss, |it| it.loss, |it| it.grad_norm];
-            // PPO takes its steps in another order, so its losses are for other weights. Only the entropy hardly
-            // changes.
+            // With PPO, a joint update takes its steps in another order than successive updates. So its losses are
+            // computed with other weights, and only the entropy hardly changes.
             let (count, share) = [(4, 1e-9), (1, 0.1)][which];
             for figure in &figures[..count] {
                 let mean = steps.iter().map(figure).sum::<f64>() / 4.0;

@@ -68,7 +68,7 @@ fn long_snapshots_are_followed_by_the_same_bytes(
     session.restore(0..n, &saved).expect("restored environments");
     assert!(session.snapshot(0..n).expect("snapshots") == saved);
     assert!(bytes_after(&mut session, &actions) == expected);
-    // Some of them, on one side of the border between two servers and over it.
+    // Restores some of the environments: on one side of the border between two servers, and across it.
     for slots in [0..2, n / 2 - 1..n / 2 + 1, n - 2..n] {
         session.restore(slots.clone(), &saved[slots.clone()]).expect("restored environments");
         assert!(session.snapshot(slots.clone()).expect("snapshots") == saved[slots]);

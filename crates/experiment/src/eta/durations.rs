@@ -8,6 +8,7 @@ use crate::folder::Folder;
 use crate::plan::{Cell, Plan};
 
 /// The process times of finished cells, by environment and method. They predict the durations of the remaining cells.
+/// Cells that run together in one process share the time of the process equally.
 #[derive(Debug, Default)]
 pub struct CellDurations<'a> {
     by_kind: HashMap<(&'a str, Method), Sum>,

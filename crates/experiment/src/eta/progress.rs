@@ -7,7 +7,7 @@
 /// Number of recent episodes over which the episode length is averaged. An average over fewer episodes would vary too
 /// much.
 const RECENT_EPISODES: f64 = 100.0;
-/// Share of all steps that must be done before there is an estimate (0 to 1).
+/// Minimum share (0 to 1) of a training's steps that must be done before the remaining steps are estimated.
 const MIN_SHARE: f64 = 0.01;
 /// Episodes count as growing if the mean length of recent episodes exceeds the mean length of all by this factor.
 const GROWTH_FACTOR: f64 = 1.3;
@@ -56,8 +56,8 @@ impl TrainingProgress {
         (done > MIN_SHARE * (done + left)).then(|| left / done)
     }
 
-    /// Returns whether [`TrainingProgress::remaining_ratio`] is probably too low. This is so early in a training whose
-    /// episodes are becoming longer.
+    /// Returns whether [`TrainingProgress::remaining_ratio`] is probably too low. This is the case early in a training
+    /// if its episodes are becoming longer.
     pub fn is_lower_bound(&self, episodes: f64) -> bool {
         let (Some((_, first)), Some(length)) = (self.first, self.length) else { return false };
         let mean = (self.last.1 - first) / (self.last.0 - self.first_episodes());

@@ -28,16 +28,18 @@ pub(crate) struct UnfinishedCell<'a> {
     pub(crate) max_seconds: Option<f64>,
 }
 
-/// Estimates the remaining time of `cells` when `at_a_time` processes run in parallel. The duration of a waiting cell
-/// is the first known of these: the mean of finished cells with its environment and method, the mean of such running
-/// cells, the measured upper bound. Returns `None` if none of these is known for some cell.
+/// Estimates the remaining time of `cells` when `at_a_time` processes run in parallel. If a cell's remaining ratio is
+/// not known, its duration is the first known of these: the mean of finished cells with its environment and method, the
+/// expected mean of running cells with its environment and method, the measured upper bound. Returns `None` if none of
+/// these is known for some cell.
 pub(crate) fn remaining_time(
     durations: &CellDurations<'_>,
     cells: &[UnfinishedCell<'_>],
     at_a_time: usize,
 ) -> Option<RemainingTime> {
     let under_way = cells.iter().filter(|cell| cell.elapsed_seconds.is_some()).count();
-    // Cells of one group share the time of their process.
+    // Cells of one group run in one process and share its time. So the process time of a running cell is this share (0
+    // to 1) of its elapsed time.
     let share = (at_a_time as f64 / under_way.max(1) as f64).min(1.0);
     let kind = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
     // Sum and number of the expected durations of running cells, by environment and method.
@@ -66,7 +68,7 @@ pub(crate) fn remaining_time(
         longest = longest.max(if one.elapsed_seconds.is_some() { rest / share } else { rest });
     }
     let at_a_time = at_a_time.clamp(1, cells.len().max(1)) as f64;
-    // Absurd budgets take longer than a duration can be.
+    // With an absurd budget, the time exceeds the maximum of `Duration`.
     let time = Duration::try_from_secs_f64((seconds / at_a_time).max(longest)).unwrap_or(Duration::MAX);
     Some(RemainingTime { time, at_most })
 }

@@ -159,7 +159,7 @@ impl File {
     /// request, by environment. Keeps names of environments that are not in the paper as written, because only servers
     /// know them.
     pub(super) fn spell(&mut self) -> Result<BTreeMap<String, u32>, AnyError> {
-        // Names of settings.
+        // Replaces the names of settings.
         self.settings = spelled("[settings]", std::mem::take(&mut self.settings))?;
         for (index, block) in self.algorithm.iter_mut().enumerate() {
             let name = format!("[[algorithm]] {} ({})", index + 1, block.name);
@@ -167,7 +167,7 @@ impl File {
             block.settings = spelled(&place("settings"), std::mem::take(&mut block.settings))?;
             block.grid = spelled(&place("grid"), std::mem::take(&mut block.grid))?;
         }
-        // Requested revisions. All names of an environment must request the same one.
+        // Collects the requested revisions. All names of an environment must request the same revision.
         let mut revisions = BTreeMap::new();
         let blocks = || self.algorithm.iter().flat_map(|block| block.environments.iter().flatten());
         for written in self.environments.iter().chain(blocks()) {
@@ -177,7 +177,7 @@ impl File {
             let expected = format!("as above, perturb/{name}-v{first}");
             require(first == revision, "environments", format!("`{written}`"), expected)?;
         }
-        // Names of environments and versions.
+        // Replaces the names of environments and versions.
         let spell_environments =
             |names: &mut Vec<String>| names.iter_mut().for_each(|name| *name = environment(name).0);
         let spell_versions = |names: &mut Vec<String>| {

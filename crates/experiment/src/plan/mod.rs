@@ -124,7 +124,8 @@ pub struct Tests {
     pub episodes: u64,
     /// The test sets: versions in the order D, R, E, R+E, then the plan's parameter sets in the plan's order.
     pub sets: Vec<TestSet>,
-    /// Episodes of the separate selection test on the training distribution; `None` if the reported tests select.
+    /// Number of episodes of the separate selection test on the training distribution; `None` if configurations are
+    /// selected by the reported tests.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub selection: Option<u64>,
     /// Marks: numbers of training episodes after which the intermediate policy is also tested, ascending and below the
@@ -341,8 +342,8 @@ impl Cell {
         format!("{} {}, trained on {}", self.config.common.environment, self.method(), self.trained_on())
     }
 
-    /// Returns the set and the number of episodes of the separate selection test. Returns `None` if the reported tests
-    /// select.
+    /// Returns the set and the number of episodes of the separate selection test. Returns `None` if configurations are
+    /// selected by the reported tests.
     pub fn selection_test(&self) -> Option<(TestSet, u64)> {
         let parameters = Contexts::Drawn(self.config.common.parameters.clone());
         let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };

@@ -13,7 +13,7 @@ use crate::folder::{CellResult, CellState, Folder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
 
-/// Maximum number of cells of an experiment that is shown to others.
+/// Maximum number of cells of an experiment that [`ExperimentStatus::read_within`] reads.
 const MAX_FOLLOWED_CELLS: usize = 50_000;
 /// The error text for a symbolic link to a file outside the shown folder.
 pub const LEADS_OUT: &str = "a link that leads out of the folder";

@@ -170,8 +170,8 @@ pub struct RunSummary {
     pub state: &'static str,
 }
 
-/// Serializes a path as text, with replacement characters if it is not UTF-8. serde's own way would fail, and with it
-/// the whole document.
+/// Serializes a path as text, with replacement characters if it is not UTF-8. serde's serialization of paths would fail
+/// for such a path, and then the whole document could not be written.
 fn as_text<S: Serializer>(path: &Path, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_str(&path.to_string_lossy())
 }

@@ -16,7 +16,8 @@ use crate::folder::FailureId;
 
 /// Interval between progress messages of a worker that has one cell.
 const INTERVAL: Duration = Duration::from_secs(1);
-/// The interval is multiplied by the number of the worker's cells, but at most by this factor.
+/// Maximum factor for [`INTERVAL`]. A worker with several cells multiplies the interval by the number of its cells, up
+/// to this factor.
 const MAX_INTERVALS: u32 = 10;
 /// Maximum number of bytes at the end of a log that are searched for its last non-empty line.
 const MAX_LAST_WORDS_BYTES: u64 = 64 << 10;
@@ -142,9 +143,9 @@ impl<W: Write> EventLineWriter<W> {
     /// Writes an event of the cell with this id. Skips a progress event if an event of the same stage was written
     /// within the interval.
     pub fn write(&mut self, cell: &str, event: CellEvent) {
-        let said =
+        let is_recent =
             |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
-        if event.stage().is_some() && self.last.get(cell).is_some_and(said) {
+        if event.stage().is_some() && self.last.get(cell).is_some_and(is_recent) {
             return;
         }
         self.last.insert(cell.to_owned(), (event.clone(), Instant::now()));
@@ -157,12 +158,12 @@ pub fn write_line(out: &mut impl Write, line: &impl Serialize) {
     let Ok(mut text) = serde_json::to_vec(line) else { return };
     text.push(b'\n');
     if let Err(error) = out.write_all(&text).and_then(|()| out.flush()) {
-        tracing::debug!(%error, "nobody reads what is told");
+        tracing::debug!(%error, "a line cannot be written");
     }
 }
 
-/// Reads the complete lines in `file` from byte `offset` on, and moves `offset` behind them. Skips all text that is not
-/// an event, because for example the prologue of a cluster's job may write to the same file.
+/// Reads the complete lines in `file` from byte `offset` on, and sets `offset` to the end of the last one. Skips all
+/// text that is not an event, because for example the prologue of a cluster's job may write to the same file.
 pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<EventLine>> {
     let mut new = Vec::new();
     let mut piece = [0; 1 << 14];

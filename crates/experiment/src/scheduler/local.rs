@@ -109,8 +109,8 @@ impl<'a> Local<'a> {
         Ok(first)
     }
 
-    /// Returns a pseudo-random index of the server for the first group. It depends on the plan's first cell. Otherwise
-    /// separate runs of single cells, such as jobs of a cluster, would all start with the same server.
+    /// Returns the index of the server for the first group: a hash of the id of the plan's first cell. With a fixed
+    /// index, separate runs of single cells, such as jobs of a cluster, would all start with the same server.
     fn first_turn(&self) -> usize {
         self.plan.cells.first().map_or(0, |cell| crc32c::crc32c(cell.id.as_bytes()) as usize)
     }
@@ -234,7 +234,7 @@ mod tests {
         lines: Vec<EventLine>,
     }
 
-    /// Runs the plan with a shell script in place of each worker, which gets one cell.
+    /// Runs the plan with a shell script in place of each worker. Each worker gets one cell.
     fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<BackendEvent>) -> Ran {
         run_grouped(Grouping { max_cells: 1, at_a_time: 2 }, folder, script, stop, server)
     }

@@ -37,7 +37,8 @@ pub const MAX_ATTEMPTS: u32 = 3;
 const MAX_FAULTS: u32 = 5;
 /// Minimum time that a cell waits for a lost server before the run ends, because a server may be restarting.
 const MIN_SERVER_WAIT: Duration = Duration::from_secs(15);
-/// Time on a server after which the count of successive losses is reset at the next loss.
+/// Duration of a connection to a server after which earlier losses no longer count: the next loss starts a new count of
+/// successive losses.
 const STABLE_CONNECTION: Duration = Duration::from_secs(60);
 /// Pause after an attempt that lost its server or could not read or write a file. The pause doubles with each further
 /// attempt that ends in the same way.
@@ -70,8 +71,8 @@ pub trait Backend {
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>>;
     /// Returns the number of groups that can start now.
     fn free_slots(&self) -> usize;
-    /// Starts some of `groups`, whose lists must not be empty. Returns the indices of the cells that are now running or
-    /// queued, including cells that already were.
+    /// Starts some of `groups`, none of which may be empty. Returns the indices of the cells that are now running or
+    /// queued, including cells that were running or queued before.
     ///
     /// # Errors
     /// [`RunError`] if the run cannot continue.
@@ -254,7 +255,7 @@ struct Tracked {
     lost_servers: usize,
     /// Number of successive attempts that lost their server.
     lost_in_a_row: u32,
-    /// Time spent waiting after these attempts.
+    /// Sum of the pauses after the attempts that `lost_in_a_row` counts.
     waited: Duration,
     /// Number of successive attempts that could not read or write a file, without a new checkpoint in between.
     faults_in_a_row: u32,
@@ -389,7 +390,7 @@ impl<'a> Scheduler<'a> {
             CellEvent::Refused { reason } => return Err(RunError::Refused(reason)),
             CellEvent::Failed { reason } => self.record_failure(cell, reason)?,
             CellEvent::LostServer { .. } => {
-                // After a connection that lasted, successive losses are counted anew.
+                // If this attempt had a server for long enough, successive losses are counted from 0 again.
                 if tracked.served.is_some_and(|since| now - since >= STABLE_CONNECTION) {
                     (tracked.lost_in_a_row, tracked.waited) = (0, Duration::ZERO);
                 }
@@ -408,7 +409,7 @@ impl<'a> Scheduler<'a> {
                 self.pause(cell, now + pause);
             }
             CellEvent::FileFault { .. } => {
-                // If this attempt saved a checkpoint, successive faults are counted anew.
+                // If this attempt saved a checkpoint, successive faults are counted from 0 again.
                 if tracked.saved_before.is_some_and(|before| tracked.saved > before) {
                     tracked.faults_in_a_row = 0;
                 }
@@ -420,8 +421,8 @@ impl<'a> Scheduler<'a> {
                 self.pause(cell, now + pause);
             }
             end => {
-                // Any other end, such as a crash. If the attempt saved no checkpoint, the next attempt runs the cell
-                // alone.
+                // Handles any other end, such as a crash. If the attempt saved no checkpoint, the next attempt runs the
+                // cell alone.
                 tracked.attempts += 1;
                 tracked.alone = tracked.saved_before.is_none_or(|before| tracked.saved <= before);
                 if tracked.attempts < MAX_ATTEMPTS {
@@ -448,7 +449,7 @@ impl<'a> Scheduler<'a> {
         self.queue.push_front(cell);
     }
 
-    /// Records a cell's failure, because its worker ended without doing so.
+    /// Records a cell's failure, because its worker ended without recording it.
     fn record_failure(&mut self, cell: usize, reason: String) -> Result<()> {
         let place = self.folder.cell(self.id(cell));
         let Some(_lock) = place.try_lock()? else {
@@ -488,16 +489,17 @@ impl<'a> Scheduler<'a> {
         matches!(phase, CellPhase::Done | CellPhase::Failed)
     }
 
-    /// Looks for results in the folder. Cells that another process was working on, but no longer is, wait for a new
-    /// attempt.
+    /// Looks for results in the folder. If another process no longer works on a cell and has left no result, the cell
+    /// waits for a new attempt.
     fn poll_results(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
         let waits = self.backend.tells_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
-            // A worker of this run writes the result first and reports it later, so its report is awaited.
-            let is_to_be_told = waits && phase == CellPhase::Running && begun.is_some();
-            if !is_to_be_told
+            // A worker of this run writes a result first and reports it later. So a cell of such a worker is skipped
+            // here, and its report is awaited.
+            let awaits_report = waits && phase == CellPhase::Running && begun.is_some();
+            if !awaits_report
                 && !self.settled(cell)
                 && self.cells[cell].phase == CellPhase::LockedByOther
                 && self.folder.cell(self.id(cell)).try_lock()?.is_some()
@@ -559,8 +561,8 @@ impl<'a> Scheduler<'a> {
         self.queue.push_back(cell);
     }
 
-    /// Returns the ids of the failed cells if all cells are settled, otherwise `None`. The error is
-    /// [`RunError::GaveUp`].
+    /// Returns the ids of the failed cells if all cells are settled, otherwise `None`. Returns [`RunError::GaveUp`] if
+    /// all cells are settled or given up, and at least one is given up.
     fn end(&self) -> Result<Option<Vec<String>>> {
         let in_phase = |phase| (0..self.cells.len()).filter(move |&cell| self.cells[cell].phase == phase);
         let left = [CellPhase::Waiting, CellPhase::Running, CellPhase::LockedByOther];

@@ -6,7 +6,8 @@ use std::fmt;
 use super::CellEvent;
 use crate::plan::Cell;
 
-/// Running cells of one group: they run in one process or, on a cluster, are of one kind.
+/// The running cells of one group. On this machine, a group runs in one process. On a cluster, a group has all running
+/// cells of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunningGroup {
     /// Environment and architecture of the cells.

@@ -9,7 +9,7 @@ use super::*;
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// An action of an attempt in a script. Each takes one simulated second.
+/// An action of an attempt in a script. Each action takes one simulated second.
 #[derive(Clone, Debug)]
 enum Act {
     Say(CellEvent),

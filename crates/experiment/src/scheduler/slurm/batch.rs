@@ -26,7 +26,7 @@ pub(super) struct CellLoad {
 }
 
 /// Divides the cells of `groups` into at most `max_jobs` jobs, in order. All cells of a job are from one group. If
-/// there would be too many jobs of a size in seconds, jobs become longer. If there are still too many, the cells of the
+/// `size` is in seconds and gives too many jobs, jobs become longer. If there are still too many jobs, the cells of the
 /// last jobs are left out and wait for a later submission. Returns the indices of each job's cells.
 pub(super) fn batches(groups: &[Vec<CellLoad>], mut size: JobSize, max_jobs: usize) -> Vec<Vec<usize>> {
     let all: f64 = groups.iter().flatten().map(|load| load.seconds).sum();

@@ -188,7 +188,8 @@ impl QueueAnswer {
     fn parse(text: &str) -> Result<Self, SlurmError> {
         let mut answer = Self::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
-            // A banner may have the separator, too. What begins with a number is a job, and must be understood.
+            // A banner may contain the separator, too. A line that begins with a digit counts as a job, so a failure to
+            // parse it is an error.
             let first = line.split_once(SEPARATOR).map(|(first, _)| first.trim());
             if first.is_some_and(|first| first.starts_with(|c: char| c.is_ascii_digit())) {
                 answer.jobs.push(parse_job(line)?);
@@ -206,7 +207,7 @@ fn parse_job(line: &str) -> Result<QueuedJob, SlurmError> {
     let [array, index, state, reason, node, name] = fields[..] else {
         return Err(not_understood("squeue", FIELDS, line));
     };
-    // The number of the user who cancelled a job may follow CANCELLED.
+    // After the state CANCELLED, squeue may print the number of the user who cancelled the job.
     let state = state.split([' ', '+']).next().unwrap_or_default();
     let index = index.parse().map_err(|_| not_understood("squeue", "an index of an array", line))?;
     let [array, state, reason, node, name] = [array, state, reason, node, name].map(str::to_owned);

@@ -44,7 +44,7 @@ pub struct Jobs<'a> {
     /// Number of Slurm's answers so far.
     answers: u32,
     /// Read positions in the jobs' event files, by number of the submission and index of the job.
-    told: HashMap<(u32, usize), LogCursor>,
+    cursors: HashMap<(u32, usize), LogCursor>,
     /// Numbers of the submissions that this process has seen in the queue.
     watched: HashSet<u32>,
     /// Cells that this backend has accepted from the scheduler and not handed back.
@@ -94,7 +94,7 @@ impl<'a> Jobs<'a> {
             last: HashMap::new(),
             queue: Vec::new(),
             answers: 0,
-            told: HashMap::new(),
+            cursors: HashMap::new(),
             watched: HashSet::new(),
             taken: HashSet::new(),
             suspects: HashSet::new(),
@@ -130,7 +130,7 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Records the job of each cell of a submission as its last job.
+    /// Records, for each cell of a submission, the job that has the cell as the cell's last job.
     fn remember(&mut self, submission: usize) {
         for (index, cells) in self.submissions[submission].jobs.iter().enumerate() {
             let cells = cells.iter().filter_map(|id| self.places.get(&**id));
@@ -139,7 +139,7 @@ impl<'a> Jobs<'a> {
     }
 
     /// Continues the run despite an error of Slurm. Reports the error to the user once.
-    fn put_up_with(&mut self, error: &RunError) {
+    fn report_and_continue(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
             self.news.push(BackendEvent::Note(format!("{words}; results are still read, and Slurm is asked again")));
@@ -147,8 +147,8 @@ impl<'a> Jobs<'a> {
         }
     }
 
-    /// Reports the arrays that are in the queue. Records the numbers of arrays whose submission was interrupted before
-    /// their number was stored.
+    /// Reports the arrays that are in the queue. Stores the number of an array if the process that submitted it was
+    /// interrupted before it could store the number.
     fn adopt(&mut self) -> Result<()> {
         for submission in &mut self.submissions {
             let jobs: Vec<_> = self.queue.iter().filter(|job| job.is_live() && submission.has(job)).collect();
@@ -173,11 +173,11 @@ impl<'a> Jobs<'a> {
         }
         // Opening the file each time makes a network file system look for new content.
         let (file, _) = open_plain(&path).map_err(io("open", &path))?;
-        let told = self.told.entry((submission.number, index)).or_default();
-        for line in read_lines(&file, &mut told.offset).map_err(io("read", &path))? {
+        let cursor = self.cursors.entry((submission.number, index)).or_default();
+        for line in read_lines(&file, &mut cursor.offset).map_err(io("read", &path))? {
             let Some(&cell) = self.places.get(&*line.cell) else { continue };
             if line.event.is_a_turn() {
-                told.cells.insert(cell);
+                cursor.cells.insert(cell);
             }
             // A job repeats failed attempts itself, so the end of an attempt is not reported while the job runs.
             if !line.event.is_last() {
@@ -194,7 +194,7 @@ impl<'a> Jobs<'a> {
         let jobs: HashSet<(usize, usize)> = self.taken.iter().filter_map(|cell| self.last.get(cell).copied()).collect();
         for (submission, index) in jobs {
             if let Err(error) = self.read(submission, index) {
-                self.put_up_with(&error);
+                self.report_and_continue(&error);
             }
         }
         let queued = self.queued();
@@ -204,16 +204,16 @@ impl<'a> Jobs<'a> {
         sure.sort_unstable();
         if !sure.is_empty() {
             self.refuse_cancelled(&missing)?;
-            self.say_lost(&sure);
+            self.report_lost(&sure);
         }
         for &cell in &sure {
             self.taken.remove(&cell);
             let job = self.last.get(&cell).map(|&(submission, index)| (self.submissions[submission].number, index));
-            let told = job.and_then(|job| self.told.get(&job)).map(|told| &told.cells);
+            let begun = job.and_then(|job| self.cursors.get(&job)).map(|cursor| &cursor.cells);
             // The job had not started this cell, so its end does not count as a failed attempt.
-            let had_its_turn = told.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
-            self.news.push(match had_its_turn {
-                true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.how_it_ended(cell) }),
+            let was_started = begun.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
+            self.news.push(match was_started {
+                true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.describe_end(cell) }),
                 false => BackendEvent::Returned(cell),
             });
         }
@@ -239,7 +239,7 @@ impl<'a> Jobs<'a> {
     }
 
     /// Tells the user which cells left the queue without a result, with the states of their jobs.
-    fn say_lost(&mut self, cells: &[usize]) {
+    fn report_lost(&mut self, cells: &[usize]) {
         let mut how =
             distinct(cells.iter().map(|&cell| self.end_of(cell)).map(|(job, state)| format!("{job} {state}")));
         if how.len() > 5 {
@@ -260,7 +260,7 @@ impl<'a> Jobs<'a> {
     }
 
     /// Describes how a cell's last job ended, with the last line of its log.
-    fn how_it_ended(&self, cell: usize) -> String {
+    fn describe_end(&self, cell: usize) -> String {
         let (job, state) = self.end_of(cell);
         let log = self.last.get(&cell).map(|&(submission, index)| self.submissions[submission].log(index));
         let log = log.unwrap_or_default();
@@ -314,7 +314,7 @@ impl<'a> Jobs<'a> {
         if self.live().next().is_none() {
             return Err(error);
         }
-        self.put_up_with(&error);
+        self.report_and_continue(&error);
         Ok(Vec::new())
     }
 
@@ -389,7 +389,7 @@ impl Backend for Jobs<'_> {
                 }
                 Err(error) if self.answers > 0 => {
                     self.deciding = None;
-                    self.put_up_with(&error);
+                    self.report_and_continue(&error);
                 }
                 Err(error) => return Err(error),
             }
@@ -417,8 +417,8 @@ impl Backend for Jobs<'_> {
                         }
                     }
                     _ if queued.contains(&offer.cell) => taken.push(offer.cell),
-                    // An earlier process submitted this cell. It is submitted again only if it is missing in two
-                    // answers.
+                    // An earlier process submitted this cell. It is submitted again only if its job is missing in two
+                    // answers of Slurm.
                     _ if self.answers == 1 && self.last.contains_key(&offer.cell) => {}
                     _ => left.push(*offer),
                 }
