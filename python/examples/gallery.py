@@ -31,7 +31,7 @@ def picture(name: str, version: perturb.Version, server: str | None) -> np.ndarr
 
 
 def main() -> None:
-    """Write a file for each environment, with version D on the left and E on the right."""
+    """Write a picture file for each environment, with version D on the left and version E on the right."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("pictures"), help="the folder for the files")
     parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")

@@ -11,7 +11,8 @@ from stable_baselines3 import PPO
 import perturb.sb3
 
 steps, episodes, folder = int(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3])
-# A study of a results table. Any --out folder of `perturb run` works, too.
+# Our agents: the study beyond/confirm-2 in the results table results.parquet. Instead of a study, the path may also be
+# any --out folder of `perturb run`.
 ours = Path(__file__).parents[2] / "results/results.parquet/beyond/confirm-2"
 assessments = []
 for environment in ("CartPole", "Hopper"):

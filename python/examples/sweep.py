@@ -1,7 +1,7 @@
-"""A simple policy on poles of many lengths: one batch, with another length in each environment. Needs only the package.
+"""A simple policy on poles of many lengths, in one batch with a different length in each environment.
 
 Each environment of a batch may have its own parameters: select it by a mask at a reset. All begin in the same state.
-Run: python sweep.py [--server unix:/path]
+Needs only the package. Run: python sweep.py [--server unix:/path]
 """
 
 import argparse

@@ -11,7 +11,7 @@ use crate::failure::{INVALID, failure};
 use crate::records::Records;
 
 /// The fields of [`PolicyMetadata`] for Python: training version, training steps, seed of the tests, episodes of each
-/// test, observations, and whether the policy was deterministic.
+/// test, what the policy observed (`state` or `parameters`), and whether the policy was deterministic.
 type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
 
 /// The recorded tests of one policy, or of several related policies, in one environment.
@@ -40,7 +40,7 @@ impl Assessment {
         self.0.write(&path, overwrite).map_err(refused)
     }
 
-    /// The name of the policies in reports.
+    /// The name in reports that the policies share.
     #[getter]
     fn agent(&self) -> &str {
         &self.0.agent
@@ -58,7 +58,7 @@ impl Assessment {
     }
 }
 
-/// Returns the report page of `assessments`, and of the experiments and assessments in the folders `beside`, as HTML.
+/// Returns the report page, as HTML, of `assessments` and of the experiments and assessments in the folders `beside`.
 #[pyfunction]
 pub fn report_page(py: Python<'_>, assessments: Vec<PyRef<'_, Assessment>>, beside: Vec<PathBuf>) -> PyResult<String> {
     let assessed = assessments.iter().map(|one| one.0.clone()).collect();

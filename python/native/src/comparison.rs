@@ -45,8 +45,8 @@ pub struct ComparedRow {
     settings: String,
 }
 
-/// Compares conditions of rows of a results table, in the tests on the given sets or on all that they have in common.
-/// Returns JSON.
+/// Compares conditions that consist of rows of a results table, in the tests on the given sets. If `sets` is None,
+/// compares them in the tests on all sets that the conditions have in common. Returns JSON.
 #[pyfunction]
 #[pyo3(signature = (conditions, sets, score, baseline))]
 pub fn compare_rows(

@@ -22,8 +22,8 @@ use crate::failure::{INVALID, LOST, MISMATCH, REFUSED, RequestFailure, UNREACHAB
 /// A task folder as a Python tuple: the path of `perturb-server`, the path of the folder, and the digest of its files.
 type TaskFolder = (PathBuf, PathBuf, String);
 
-/// The catalogues with the task of a folder, by the folder's path and digest. A loaded task stays in memory until the
-/// process ends, so each folder is loaded only once.
+/// For each loaded task folder: its path, the digest of its files, and a catalogue that contains its task. A task stays
+/// in memory until the process ends, so each folder is loaded only once.
 #[cfg(feature = "mujoco")]
 static LOADED: Mutex<Vec<((PathBuf, String), Catalogue)>> = Mutex::new(Vec::new());
 
@@ -88,7 +88,8 @@ impl NativeServer {
 impl Drop for NativeServer {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
-            // A forked process does not have the server's threads, so it cannot wait for them.
+            // Dropping the server waits for its threads. A forked process does not have these threads, so it leaks the
+            // server instead.
             std::mem::forget(self.server.get_mut().unwrap_or_else(PoisonError::into_inner).take());
         }
     }
@@ -109,9 +110,9 @@ pub struct EmbeddedStream {
     offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
     /// Steps that wait until the running one has finished.
     waiting: VecDeque<SessionRequest>,
-    /// Answers that were not received yet.
+    /// Answers to steps that have finished, until [`receive`](Self::receive) takes them.
     answers: VecDeque<Answer>,
-    /// Decides whether to spin or to block while the workers run a step.
+    /// Decides whether this thread spins or blocks while the server's workers run a step.
     spin: AdaptiveSpin,
 }
 
@@ -183,7 +184,7 @@ impl EmbeddedStream {
         reply::<A>(answer)
     }
 
-    /// Starts the steps in `waiting` in order, until one of them does not finish at once.
+    /// Starts the steps in `waiting` in order, until a step is still running after its first poll.
     fn advance(&mut self) {
         while self.running.is_none() {
             let Some(request) = self.waiting.pop_front() else { return };
@@ -233,10 +234,10 @@ fn defect() -> RequestFailure {
     RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
 }
 
-/// Polls a future once, and returns its output if it is ready. This needs no runtime.
+/// Polls a future once, and returns its output if it is ready. The caller needs no async runtime.
 pub fn poll_once<T>(future: Pin<&mut (dyn Future<Output = T> + Send + '_)>) -> Option<T> {
     match future.poll(&mut Context::from_waker(Waker::noop())) {
-        Poll::Ready(come) => Some(come),
+        Poll::Ready(output) => Some(output),
         Poll::Pending => None,
     }
 }

@@ -25,7 +25,7 @@ impl EpisodeTable {
         Self { requested, width: requested + applied, ..Self::default() }
     }
 
-    /// Adds the episodes of messages. Messages without a receipt are skipped.
+    /// Adds a row for each message. Skips messages without an episode or without a receipt.
     ///
     /// # Errors
     /// If a receipt has a wrong number of values.
@@ -43,8 +43,9 @@ impl EpisodeTable {
         Ok(self)
     }
 
-    /// Decodes the protocol's arrays of `episodes` (uint64 `[m, 5]`) and `values` (float64 `[m, P + Q]`). Returns a
-    /// table of the first `ended` episodes and a table of the others.
+    /// Decodes the arrays of a reply: `episodes` (uint64 `[m, 5]`) and `values` (float64 `[m, P + Q]`). The rows of the
+    /// episodes that ended come first, and `ended` is their number. Returns a table of these episodes, and a table of
+    /// the episodes that began.
     ///
     /// # Errors
     /// If the lengths of the arrays do not match.
@@ -67,7 +68,7 @@ impl EpisodeTable {
         self.episodes.iter().copied().zip(self.values.chunks(self.width.max(1)))
     }
 
-    /// Returns the receipt of the `index`th episode, with the given model hash.
+    /// Returns the receipt of the episode in row `index`, with the given model hash. Returns `None` without such a row.
     pub fn receipt(&self, index: usize, model_hash: &str) -> Option<proto::Receipt> {
         let (_, values) = self.rows().nth(index)?;
         let (requested, applied) = values.split_at(self.requested);

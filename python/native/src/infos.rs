@@ -50,7 +50,7 @@ impl Label {
     }
 }
 
-/// The keys of a session's infos as Python strings, so that they are made only once.
+/// The keys of a session's infos as Python strings. The session makes these strings once, not in each step.
 pub struct InfoKeys {
     /// Number of environments N.
     num_envs: usize,
@@ -228,8 +228,8 @@ impl Events {
     }
 
     /// Returns the infos of a batch. `moved`, bool `[N]`, is the mask of environments that took a step; `None` means
-    /// all. With `same_step`, the infos of ended episodes are in `final_info`, apart from those of the episodes that
-    /// began.
+    /// all. `same_step` is true if an ended episode and the reset after it are in one step. The key `final_info` then
+    /// has the infos of the episodes that ended, and the other keys have the infos of the episodes that began.
     #[pyo3(signature = (moved, same_step))]
     fn batch<'py>(
         &self,
@@ -286,10 +286,10 @@ impl Events {
         set(infos, &known.achieved, self.column(py, achieved), &mask)
     }
 
-    /// Adds the parameters and receipts of the episodes in the tables `parts`. If several tables have an episode of the
-    /// same environment, the last of these tables counts.
-    fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, parts: [&EpisodeTable; P]) -> PyResult<()> {
-        let rows = || parts.iter().flat_map(|part| part.rows());
+    /// Adds the parameters and receipts of the episodes in `tables` to `infos`. If several tables have an episode of
+    /// the same environment, the episode in the last of these tables is used.
+    fn receipts<const P: usize>(&self, infos: &Bound<'_, PyDict>, tables: [&EpisodeTable; P]) -> PyResult<()> {
+        let rows = || tables.iter().flat_map(|table| table.rows());
         if rows().next().is_none() {
             return Ok(());
         }
@@ -335,7 +335,7 @@ impl Events {
         set(infos, &self.labels.known.reward_terms, named, &mask)
     }
 
-    /// Makes an array `[N]` from pairs of a slot and a value. Other slots are zero.
+    /// Makes an array `[N]` from pairs of a slot and a value. Slots without a value are zero.
     fn column<'py, T: Element + Copy + Default>(
         &self,
         py: Python<'py>,

@@ -41,13 +41,14 @@ impl Policy {
         &self.checkpoint.state.config.common.environment
     }
 
-    /// The version that the training parameters came from.
+    /// The version that the parameters of the training came from: `D`, `R`, `E` or `R+E`.
     #[getter]
     fn version(&self) -> String {
         self.checkpoint.state.config.common.version.to_string()
     }
 
-    /// The version that the training parameters came from, with any values that replaced the version's.
+    /// The version that the parameters of the training came from, and the values that replaced some of them, such as
+    /// `D with length [0.3, 0.4]`.
     #[getter]
     fn trained_on(&self) -> String {
         self.checkpoint.state.config.common.trained_on()
@@ -65,7 +66,7 @@ impl Policy {
         self.checkpoint.state.config.settings.episodes_per_trial()
     }
 
-    /// Whether the policy also takes the last action, its reward and the ends of episodes as inputs (RL²).
+    /// Whether the policy's inputs also include the last action, its reward and whether an episode ended (RL²).
     #[getter]
     fn sees_rewards(&self) -> bool {
         self.checkpoint.state.config.settings.has_trials()
@@ -77,7 +78,7 @@ impl Policy {
         self.checkpoint.policy.memory_size() > 0
     }
 
-    /// The contents of the policy's observations: "state" or "parameters".
+    /// The policy's setting `observe`: "state", or "parameters" if the parameters are part of its observations.
     #[getter]
     fn observe(&self) -> String {
         self.checkpoint.state.config.common.observe.to_string()
@@ -127,8 +128,8 @@ impl Policy {
     }
 }
 
-/// A policy that chooses actions in N environments, with its memory for each of them. Only one thread at a time may use
-/// it.
+/// A policy that chooses actions in N environments, with a separate memory for each environment. Only one thread at a
+/// time may use it.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct Player(Mutex<Playing>);
 
@@ -140,8 +141,8 @@ struct Playing {
     trials: Vec<(u64, u32)>,
     /// Episodes that ended in the last step.
     ended: Vec<SlotEnd>,
-    /// Zeros `[ended, O]` in place of final observations. The player's interface requires them, but actions do not
-    /// depend on them.
+    /// Zeros `[ended, O]` in place of the final observations of ended episodes. The player's interface requires final
+    /// observations, but actions do not depend on them.
     finals: Vec<f32>,
 }
 
@@ -186,7 +187,7 @@ impl Playing {
         let observations = self.rows(observations)?;
         self.trials.fill((0, 0));
         self.player.begin(&observations, None).map_err(|error| refused(&error))?;
-        // The random streams may have advanced to later trials. They return to the first trial.
+        // After an earlier use of this player, its random streams may be those of later trials. Go back to the first.
         (0..self.trials.len()).for_each(|slot| self.player.begin_trial(slot, self.seed, 0));
         Ok(())
     }

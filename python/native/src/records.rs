@@ -19,14 +19,14 @@ use crate::sets::{Set, to_python};
 /// Number of resamples of the bootstrap over episodes.
 const RESAMPLES: usize = 1000;
 
-/// A mean and its standard deviation if known, %.
+/// The mean over runs, and the standard deviation over runs if it is known, %.
 type MeanAndDeviation = (f64, Option<f64>);
 
 /// A bin of a parameter's range: lower and upper edge, successes, episodes, and both ends of the success rate's 95 %
 /// interval, %.
 type BinRow = (f64, f64, u64, u64, f64, f64);
 
-/// A cell of a grid over two parameters: the edges in x, the edges in y, successes, episodes.
+/// A cell of a grid over two parameters x and y: its range of x, its range of y, successes, episodes.
 type GridRow = ((f64, f64), (f64, f64), u64, u64);
 
 /// The statistics of a test: number of episodes, success rate (%) and its interval, mean return and its interval, mean
@@ -155,13 +155,14 @@ impl Records {
         })
     }
 
-    /// Returns the context of each episode `[n]` of the test on a set: the number, from 0, of a context in a list, or
-    /// of a region of the parameter space.
+    /// Returns a context's number for each episode `[n]` of the test on a set. Contexts are numbered from 0. If the set
+    /// has a list of contexts, these are the contexts. Otherwise each context is a region of the parameter space.
     fn parts(&self, name: &str) -> Vec<usize> {
         Outcomes::new(&self.0, name).parts()
     }
 
-    /// Returns the success on a set in each cell of a grid over two parameters, ordered by y and then x.
+    /// Returns the successes in the test on a set, in each cell of a grid over two parameters. The cells are ordered by
+    /// y and then x.
     fn success_by_parameters(&self, name: &str, x: &str, y: &str) -> PyResult<Vec<GridRow>> {
         let places = [self.place(x)?, self.place(y)?];
         let outcomes = Outcomes::new(&self.0, name);
@@ -175,17 +176,17 @@ impl Records {
         Ok(pairs.zip(counted).map(cell).collect())
     }
 
-    /// Returns the success on a set in each bin of a parameter's range.
+    /// Returns the successes in the test on a set, in each bin of a parameter's range.
     fn success_by_parameter(&self, name: &str, parameter: &str) -> PyResult<Vec<BinRow>> {
         let place = self.place(parameter)?;
         let outcomes = Outcomes::new(&self.0, name);
         let bins = bins(std::iter::once(&outcomes), place);
         let counted = success_within(&outcomes, place, &bins);
-        let told = bins.iter().zip(counted).map(|(bin, counted)| {
+        let rows = bins.iter().zip(counted).map(|(bin, counted)| {
             let [low, high] = counted.interval();
             (bin.low, bin.high, counted.successes, counted.episodes, low, high)
         });
-        Ok(told.collect())
+        Ok(rows.collect())
     }
 }
 
@@ -217,7 +218,7 @@ fn add_columns(dictionary: &Bound<'_, PyDict>, columns: Vec<(String, ColumnValue
                 numbers(name, values.into_iter().map(|number| number.unwrap_or(f64::NAN)).collect())?;
             }
             ColumnValues::OptionalUnsigned64(values) => {
-                // The conversion is exact up to 2^53. No count of episodes or steps is larger.
+                // The conversion to a float is exact up to 2^53. No count of episodes or steps is larger.
                 numbers(name, values.into_iter().map(|count| count.map_or(f64::NAN, |count| count as f64)).collect())?;
             }
         }
@@ -251,8 +252,9 @@ pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, O
     (default, interpolation, extrapolation)
 }
 
-/// Returns the paper's methods in an environment. Each has the mean and the standard deviation over five runs of
-/// Default, Interpolation and Extrapolation, %.
+/// Returns the results that Packer et al. (2018) published for an environment. Each entry has a method's name and its
+/// metrics Default, Interpolation and Extrapolation. A metric is the mean and the standard deviation over five runs, %;
+/// `None` if the paper does not have it.
 #[pyfunction]
 pub fn published(environment: &str) -> Vec<(String, Vec<Option<MeanAndDeviation>>)> {
     let numbers = |method| {

@@ -85,8 +85,8 @@ impl Actions {
             .or_else(|| self.read(actions, |choice: i32| Some(choice.to_le_bytes())))
     }
 
-    /// Encodes the numbers of an array. Returns `None` if it does not have type `T`, the expected shape, and contiguous
-    /// elements, or if `encode` returns `None` for a number.
+    /// Encodes the numbers of an array. Returns `None` if the array does not have type `T`, the expected shape and
+    /// contiguous elements. Also returns `None` if `encode` returns `None` for a number.
     fn read<T: Element + Copy>(
         &self,
         actions: &Bound<'_, PyAny>,
@@ -107,7 +107,7 @@ impl Actions {
     }
 }
 
-/// Whether this is an integer of Python or NumPy. A bool does not count.
+/// Whether the action is an integer of Python or NumPy. A bool is not.
 fn is_integer(action: &Bound<'_, PyAny>) -> bool {
     static NUMPY_INTEGER: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     action.is_exact_instance_of::<PyInt>()

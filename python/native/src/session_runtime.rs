@@ -37,7 +37,7 @@ pub enum WaitError {
     Closed,
 }
 
-/// A flag by which another thread ends a session that waits for a reply.
+/// A flag with which one thread closes a session while another thread waits for the session's reply.
 #[derive(Default)]
 pub struct CloseSignal {
     closed: AtomicBool,
@@ -66,7 +66,7 @@ struct Reactor {
     owner: u32,
 }
 
-/// The runtimes that are in use.
+/// All runtimes of this process that sessions use.
 static REACTORS: Mutex<Vec<Weak<Reactor>>> = Mutex::new(Vec::new());
 
 impl Reactor {
@@ -77,14 +77,15 @@ impl Reactor {
 
     /// Returns a new runtime, or the one with the fewest sessions if there are [`MAX_RUNTIMES`].
     fn find() -> io::Result<Arc<Self>> {
-        // In a forked process, the lock may be held forever, because the fork did not copy the thread that holds it.
+        // In a forked process, nobody may ever release the lock, because the fork did not copy the thread that holds
+        // the lock. Do not wait for it: make a separate runtime.
         let Ok(mut reactors) = REACTORS.try_lock() else { return Self::new() };
         let own = std::process::id();
         let used: Vec<_> = reactors.iter().filter_map(Weak::upgrade).filter(|reactor| reactor.owner == own).collect();
         if used.len() >= MAX_RUNTIMES
-            && let Some(least) = used.iter().min_by_key(|reactor| Arc::strong_count(reactor))
+            && let Some(least_used) = used.iter().min_by_key(|reactor| Arc::strong_count(reactor))
         {
-            return Ok(Arc::clone(least));
+            return Ok(Arc::clone(least_used));
         }
         let reactor = Self::new()?;
         *reactors = used.iter().chain([&reactor]).map(Arc::downgrade).collect();
@@ -98,8 +99,8 @@ impl Drop for Reactor {
         if std::process::id() == self.owner {
             runtime.shutdown_background(); // does not wait for a running DNS lookup
         } else {
-            // A forked process shares the parent's epoll. Dropping the runtime would remove the parent's connection
-            // from it.
+            // A forked process shares its parent's epoll instance. If it dropped the runtime, the parent's connection
+            // would be removed from that instance.
             std::mem::forget(runtime);
         }
     }
@@ -136,18 +137,18 @@ impl SessionRuntime {
                 Some(deadline) => SIGNAL_CHECK_INTERVAL.min(deadline.saturating_duration_since(Instant::now())),
                 None => SIGNAL_CHECK_INTERVAL,
             };
-            let come = py.detach(|| {
+            let output = py.detach(|| {
                 runtime.block_on(async {
                     tokio::select! {
                         biased;
-                        come = &mut pending => Some(come),
+                        output = &mut pending => Some(output),
                         () = closing.notify.notified() => None,
                         () = tokio::time::sleep(wait) => None,
                     }
                 })
             });
-            match come {
-                Some(come) => return Ok(come),
+            match output {
+                Some(output) => return Ok(output),
                 None if closing.is_closed() => return Err(WaitError::Closed),
                 None => py.check_signals().map_err(WaitError::Interrupted)?,
             }

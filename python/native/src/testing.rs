@@ -28,9 +28,9 @@ pub struct Tests {
     success: Option<Rule>,
     policy: String,
     episodes_per_trial: u32,
-    /// The environment that the first session opened, and the records of all tests.
+    /// The environment of the first test, and the records of all finished tests. `None` before the first test.
     begun: Option<(Arc<proto::Environment>, perturb_records::Records)>,
-    /// The running test.
+    /// Collects the episodes of the running test. `None` if no test is running.
     counting: Option<TestCollector>,
 }
 
@@ -67,9 +67,9 @@ impl Tests {
         Ok(plan)
     }
 
-    /// Checks the environment of a test's session after the session was opened. The
-    /// first environment must fit all sets, and must equal the environment that a loaded policy was trained in. The
-    /// environments of later tests must equal the first environment.
+    /// Checks the server's description of the environment after a test's session was opened. In the first test, the
+    /// environment must fit all sets, and must equal the environment that `policy` was trained in. In later tests, the
+    /// environment must equal that of the first test.
     #[pyo3(signature = (opened, policy))]
     fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
         let served = opened.served();
@@ -100,7 +100,7 @@ impl Tests {
                 EndedEpisode::from_proto(end, slot, terminated.get(slot).copied().unwrap_or_default())
             };
             let ended: Option<Vec<EndedEpisode>> = events.ended().map(ended).collect();
-            let unnamed = "the server sent the end of an episode without its address or its receipt; this is a server bug, \
+            let unnamed = "the server sent the end of an episode without its indices or its receipt; this is a server bug, \
                            please report it";
             counting.take(ended.ok_or_else(|| failure(MALFORMED, 0, unnamed))?);
         }

@@ -68,7 +68,7 @@ class Description:
     # The lowest and the highest accepted value of each disturbance, by name. A session has disturbances only if its
     # parameters name at least one disturbance.
     disturbances: Mapping[str, Range] = field(default_factory=dict, compare=False)
-    # The value at which each disturbance has no effect, by name.
+    # For each disturbance, by name, the value at which it has no effect.
     undisturbed: Mapping[str, float] = field(default_factory=dict, compare=False)
     # The range of each disturbance's entry in observations, by name.
     disturbance_observations: Mapping[str, Range] = field(default_factory=dict, compare=False)
@@ -151,7 +151,7 @@ class Description:
         return spaces.Discrete(self.actions) if isinstance(self.actions, int) else _box(self.actions)
 
     def require_equal(self, served: Description) -> None:
-        """Check that the server's environment is this one.
+        """Check that the server's environment has this description.
 
         Raises:
             ProtocolError: if the revision, the spaces or the timestep differ.
@@ -200,7 +200,7 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
 _WRITTEN: Mapping[str, Any] = json.loads(resources.files(__package__).joinpath("catalogue.json").read_text("utf-8"))
 _LIMITS: Mapping[str, Any] = _WRITTEN["limits"]
 
-# The descriptions as the server wrote them in JSON.
+# The environments' descriptions as the server prints them in JSON, as dictionaries.
 CATALOGUE_ENTRIES: tuple[Mapping[str, Any], ...] = tuple(_WRITTEN["environments"])
 CATALOGUE: dict[str, Description] = {
     description.name: description for description in map(Description.read, CATALOGUE_ENTRIES)

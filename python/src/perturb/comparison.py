@@ -22,11 +22,12 @@ if TYPE_CHECKING:
     from .requests import Version
     from .success_rules import SuccessRule
 
-# Default number of episodes of each test, and default seed of the tests. Saved assessments have their own.
+# Default number of episodes of each test, and default seed of the tests. If there are saved assessments, the number and
+# the seed of the first one are the defaults instead.
 EPISODES, SEED = 1000, 1
 # The file by which the folder of an assessment is recognised.
 _ASSESSMENT = "assessment.json"
-# What a comparison needs of each row of a results table.
+# The columns of a results table that a comparison needs.
 _COLUMNS = (
     "study",
     "cell",
@@ -82,14 +83,14 @@ def compare(
 
     Args:
         conditions: the policies of each condition, by a name of your choice: one policy, a list, or a mapping by keys
-            such as training seeds. The key of a policy in a list is its seed if all are policies of `load_policy` with
-            distinct seeds, and else its position. A policy is one that `evaluate` accepts, an `Assessment`, or the
-            path of a saved assessment or of a checkpoint. Or each condition has rows of `read_results`, such as
-            `dict(list(rows.groupby("algorithm")))`. Rows have no episodes: only success has an interval over episodes,
-            from its counts.
+            such as training seeds. In a list, the keys are the policies' training seeds if `load_policy` returned all
+            of them and their seeds differ. Otherwise the keys are the positions in the list. A policy is one that
+            `evaluate` accepts, an `Assessment`, or the path of a saved assessment or of a checkpoint. Instead of
+            policies, each condition may have rows of `read_results`, such as `dict(list(rows.groupby("algorithm")))`.
+            Rows have numbers of successes but no episodes, so only success rates have an interval over episodes.
         environment: as in `evaluate`. Leave it out if all policies are assessments or rows.
-        versions: as in `evaluate`. For assessments and rows, the tests to compare: by default all that
-            they have in common. Sets of rows are given by their names.
+        versions: as in `evaluate`. For assessments and rows, the tests to compare, by default all tests that they have
+            in common. For rows, a set may be given by its name.
         episodes: as in `evaluate`. By default the number of the first assessment, or 1000 without assessments.
         seed: seed of all tests. By default the seed of the first assessment, or 1 without assessments.
         parameters: as in `evaluate`.

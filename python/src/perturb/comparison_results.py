@@ -26,9 +26,9 @@ class ConditionMean:
     seeds_interval: Interval | None
     # The number of episodes of each policy.
     episodes: int
-    # The 95 % interval over episodes. It estimates what the same policies would give in other episodes. For success
-    # rates it is a Wilson interval with the effective number of episodes, because all policies play the same ones. For
-    # other scores it is a t interval.
+    # The 95 % interval over episodes. It estimates what the same policies would give in other episodes. For returns and
+    # lengths it is a t interval. For success rates it is a Wilson interval. All policies play the same episodes, so its
+    # number of episodes is an effective number, which accounts for their correlation.
     episodes_interval: Interval | None
 
     @property
@@ -49,7 +49,7 @@ class ConditionDifference:
     y: str
     # The name of the test set.
     tested_on: str
-    # The numbers of policies of x and of y.
+    # The number of policies of x, and the number of policies of y.
     seeds: tuple[int, int]
     # Whether policies of x and y with the same key are compared as pairs.
     paired: bool

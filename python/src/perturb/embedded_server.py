@@ -14,13 +14,14 @@ from .local_server import find_program
 if TYPE_CHECKING:
     from .local_server import TaskFolder
 
-# A lock that is held while models are loaded, compiled or drawn, and during a fork. Otherwise a forked process could
-# inherit locks that no thread releases. A thread that holds the lock of `local_server` must not wait for this lock.
+# A lock that is held while models are loaded, compiled or drawn, and during a fork. The fork thus waits for this work.
+# Without it, a forked process could inherit locks of the work that no thread releases. A thread that holds the lock of
+# `local_server` must not wait for this lock.
 loading = threading.RLock()
 
 
 class EmbeddedServer:
-    """A server that runs in this process until `end`."""
+    """A server that runs in this process until `end` is called."""
 
     address = EMBEDDED
 

@@ -76,10 +76,10 @@ def evaluate(
             last episode of each trial counts. If a set has a list of contexts, the episodes are divided equally among
             the contexts, and each context has at least one.
         seed: fixes all randomness, 0 … 2^64 - 1. By default the training seed of a policy of `load_policy`, else 1.
-        parameters: adds a test called `parameters`. In it, these values replace those of the version `base`, by
-            parameter: a number, an interval `(low, high)` or `"low..high"`, or several.
-        contexts: adds a test called `contexts`, on this list of contexts. A context has a value of each parameter that
-            it names.
+        parameters: adds a test called `parameters`, in which these values replace those of the version `base`. A value
+            is a number, an interval `(low, high)` or `"low..high"`, or several intervals.
+        contexts: adds a test called `contexts`, on this list of contexts. A context is a mapping from names of
+            parameters to values.
         base: the version of all parameters that `parameters` or `contexts` do not name.
         trained_on: the version that the policy was trained on, for the names of its scenarios. Leave it out for a
             policy of `load_policy`, which knows its version.
@@ -92,10 +92,11 @@ def evaluate(
             sampling. True by default, as in stable-baselines3's `evaluate_policy`. Policies of `load_policy` sample.
         normalizer: for a stable-baselines3 model, its VecNormalize, which is only read, or the path of a saved one.
             False for none. By default the VecNormalize of the model's environment. A model that was loaded without its
-            environment has none, and is refused if it was trained with one. If `policy` is a mapping, a mapping with
-            the same keys.
-        name: the policy's name in records and reports. By default records have the policy's id, its class with a
-            checksum of its weights, or the function's name. Reports have the policy's kind.
+            environment has no VecNormalize, and is refused if it was trained with one. If `policy` is a mapping, pass
+            a mapping with the same keys.
+        name: a name for the policy in records and reports. By default records name a function by its own name, and a
+            model by its class and a checksum of its weights. Reports leave the checksum out. Do not pass `name` for a
+            policy of `load_policy`: records have its id, and reports its method, such as `ppo ff`.
         server: the server's address, `unix:/path` or `host:port`, or `embedded` for a server in this process. None
             starts a private server.
         task: the folder of a task to serve; see docs/tasks.md. It needs a private or an embedded server.

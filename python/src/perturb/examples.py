@@ -21,6 +21,6 @@ def example_policies() -> dict[Version, Policy]:
 
     On D, the default physics, both policies run 20 m in more than nine of ten episodes. On R, where power, torso mass
     and friction are random, the policy that was trained on D falls in most episodes. The policy that was trained on R
-    runs 20 m in two thirds of them.
+    runs 20 m in two thirds of its episodes.
     """
     return {"D": load_policy(_FOLDER / "Hopper-D.safetensors"), "R": load_policy(_FOLDER / "Hopper-R.safetensors")}

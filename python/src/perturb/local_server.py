@@ -70,11 +70,11 @@ def find_program() -> Path:
 
 @dataclass(frozen=True)
 class TaskFolder:
-    """A task folder and the state of its files. Environments share a server if both are equal."""
+    """A task folder and the state of its files. Environments share a server if their folder and its state are equal."""
 
     # Absolute path of the folder.
     path: str
-    # Digest of the names, sizes and modification times of all files that a task may read.
+    # Digest of the names, sizes and modification times of all files in the folder that a task may read.
     files: str
 
 
@@ -129,7 +129,7 @@ class LocalServer:
 
     def end(self) -> None:
         """End the server and wait until it has ended. Close its sessions first."""
-        # The finalizer itself is not called, because it would do nothing while _at_exit runs.
+        # Call the function `_end` directly. The finalizer would do nothing while Python exits and `_at_exit` runs.
         if self._unended.detach() is not None:
             _end(self.process, self._directory, self._owner)
 
@@ -144,7 +144,7 @@ class LocalServer:
 
     def _wait_until_ready(self, program: Path) -> None:
         lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
-        # This thread reads all of the server's output, so that the server never blocks on a full pipe.
+        # Start a thread that reads all of the server's output, so that the server never blocks on a full pipe.
         try:
             start_thread("perturb-server-output", _read, self.process.stdout, lines)
         except PerturbError as error:
@@ -242,7 +242,7 @@ def acquire(kind: type[Server], task: TaskFolder | None = None) -> Server:
 
 
 def release(server: OwnServer, *, wait: bool = True) -> bool:
-    """Release a server that `acquire` returned. The release of its last user ends the server.
+    """Release a server that `acquire` returned. End the server if no session uses it any more.
 
     Return True if the server was released. If `wait` is false and another thread holds the lock, for example to start a
     server, do nothing and return False.

@@ -1,6 +1,6 @@
 """Finds the VecNormalize of a stable-baselines3 model.
 
-A model that was trained with a VecNormalize fails without it, because its observations then have another scale.
+A model that was trained with a VecNormalize plays badly without it, because its observations then have another scale.
 """
 
 from __future__ import annotations

@@ -55,7 +55,7 @@ class PolicyUnderTest:
     name: str
     # Makes a player from the number of environments N and the seed of a test.
     player: Callable[[int, int], Player]
-    # The name in reports. Policies of one training method share it.
+    # The name in reports, which policies of one training method share.
     agent: str = ""
     # The policy, if it is one of `load_policy`.
     loaded: Policy | None = None
@@ -73,8 +73,7 @@ def prepare(
     `deterministic` is True, False, or None for the default of the policy's kind.
 
     Raises:
-        PolicyError: if the object is not a policy, does not fit the environment, or is of a kind without an option that
-            was given.
+        PolicyError: if the object is not a policy, does not fit the environment, or does not support a given option.
     """
     if isinstance(policy, Policy):
         if deterministic or normalizer not in (None, False) or name is not None:
@@ -86,7 +85,7 @@ def prepare(
         player = lambda num_envs, seed: native(loaded.player, num_envs, seed, 0)  # noqa: E731
         return PolicyUnderTest(policy.id, player, policy.method, policy, loaded.timesteps, False)
     if _is(policy, "stable_baselines3.common.base_class", "BaseAlgorithm"):
-        # The mode is the default of stable-baselines3's evaluate_policy.
+        # The default is the mode of the action distribution, as in stable-baselines3's evaluate_policy.
         return _stable_baselines(policy, description, deterministic is not False, normalizer, name)
     if deterministic:
         raise PolicyError("deterministic=True is for stable-baselines3's models: make the policy itself deterministic")
@@ -154,10 +153,10 @@ class _Function:
         observations = self._observations.copy()  # the function may change its argument
         if not self._remembers:
             return self._function(observations)
-        came = self._function(observations, self._memory, self._starts)
-        if not isinstance(came, tuple) or len(came) != 2:
-            raise PolicyError(f"a function with memory gave {type(came).__name__}; expected a pair (actions, memory)")
-        actions, self._memory = came
+        result = self._function(observations, self._memory, self._starts)
+        if not isinstance(result, tuple) or len(result) != 2:
+            raise PolicyError(f"a function with memory gave {type(result).__name__}; expected a pair (actions, memory)")
+        actions, self._memory = result
         return actions
 
     def observe(
@@ -219,12 +218,12 @@ class _Module:
         try:
             with torch.no_grad():
                 seen = torch.from_numpy(self._observations.copy()).to(self._device, self._dtype)
-                came = self._module(seen)
+                raw = self._module(seen)
         finally:
             self._module.train(training)
-        if not isinstance(came, torch.Tensor):
-            raise PolicyError(f"the torch module gave {type(came).__name__}; expected a tensor: wrap it in a function")
-        actions = came.cpu().numpy()
+        if not isinstance(raw, torch.Tensor):
+            raise PolicyError(f"the torch module gave {type(raw).__name__}; expected a tensor: wrap it in a function")
+        actions = raw.cpu().numpy()
         if self._choices is None or actions.dtype.kind in "iu":
             return actions
         expected = (len(self._observations), self._choices)

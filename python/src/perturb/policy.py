@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike, NDArray
 
-# Maximum number of environments of an actor, whose memory is allocated at once.
+# Maximum number of environments of an actor. The limit exists because the actor allocates memory for all of them at
+# once.
 MAX_ENVIRONMENTS = 1 << 20
 
 
@@ -39,13 +40,14 @@ class Policy:
     Attributes:
         id: identifies the policy by the number of its training iterations and a checksum of its weights.
         environment: the name of the environment that it was trained in.
-        version: the version that its training parameters came from: `D`, `R`, `E` or `R+E`.
-        trained_on: the version, with any values that replaced the version's, such as `D with length [0.3, 0.4]`.
+        version: the version that the parameters of its training came from: `D`, `R`, `E` or `R+E`.
+        trained_on: the version, and the values that replaced some of its parameters, such as
+            `D with length [0.3, 0.4]`.
         method: the algorithm and architecture, such as `ppo ff` or `rl2-ppo rc N=2`.
         episodes_per_trial: the number of episodes after which the memory of an RL² policy is reset; 1 for other
             policies.
         has_memory: whether the policy is recurrent.
-        sees_rewards: whether the policy also takes the last action, its reward and the ends of episodes as inputs
+        sees_rewards: whether the policy's inputs also include the last action, its reward and whether an episode ended
             (RL²).
         observe: what the policy observes: `state`, or `parameters` for the state and the environment's parameters.
         seed: the seed of its training.
@@ -163,7 +165,7 @@ class Actor:
         Args:
             observations: observations [N, O], not normalised. The first call begins a trial in every environment.
             starts: bool [N], true where the observation is the first one of an episode. By default false everywhere.
-                When an episode starts that is the first of a new trial, the policy's memory is reset.
+                If that episode is the first of a new trial, the policy's memory is reset.
             rewards: rewards [N] of the last actions, not normalised. Only RL² policies need them.
 
         Raises:

@@ -6,7 +6,7 @@ import gymnasium
 
 from .catalogue import CATALOGUE
 
-# The suffixes that stand for the versions in the ids of the paper's code.
+# The suffix of each version in the ids of the paper's code, such as `SunblazeHopperRandomNormal-v0`.
 _OLD_SUFFIXES = {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}
 
 

@@ -184,8 +184,8 @@ def seed(value: Any, name: str = "seed") -> int:
 def seeds(value: Any, num_envs: int) -> list[int | None]:
     """Return the seeds of N environments.
 
-    One seed s gives environment i the seed s + i. A list has a seed for each environment; None in it continues with the
-    environment's last seed.
+    One seed s gives environment i the seed s + i. A list has a seed for each environment. None in the list lets an
+    environment continue with its last seed.
     """
     if value is None:
         return [None] * num_envs
@@ -244,7 +244,8 @@ def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
 def parameter_values(parameters: Parameters, description: Description) -> Intervals:
     """Convert parameters to intervals, and check names and bounds.
 
-    `distributions` leaves these checks to the server. They are needed here if the server gets the values only later.
+    The function `distributions` leaves these checks to the server. Use `parameter_values` if the values are sent to the
+    server only later, so that wrong values are refused at once.
 
     Raises:
         UnknownNameError: if the environment has no such parameter.

@@ -70,9 +70,10 @@ class Result:
     return_interval: tuple[float, float]
     # The mean length of episodes, in steps.
     mean_length: float
-    # CVaR 10 % (Rockafellar and Uryasev, 2000): the mean of the lowest tenth of returns, whose number is rounded up.
+    # CVaR 10 % (Rockafellar and Uryasev, 2000): the mean of the lowest tenth of returns. A tenth of the number of
+    # episodes is rounded up.
     cvar_return: float
-    # The bootstrap interval of CVaR.
+    # The bootstrap interval of `cvar_return`, from 1000 resamples of the episodes.
     cvar_interval: tuple[float, float]
     # The success rate, %, in the worst tenth of contexts. Contexts are regions of the parameter space with about 40
     # episodes each. One half of the episodes selects the worst contexts, and the other half measures the success rate.
@@ -125,7 +126,8 @@ class Bin2D:
 class Context:
     """Success in one context of a list, or in one region of the parameter space if parameters are drawn."""
 
-    # The lowest and highest value of each varying parameter in these episodes, by name. Equal for a context of a list.
+    # The lowest and the highest value of each varying parameter in the context's episodes, by name. They are equal if
+    # the context is one of a list.
     parameters: Mapping[str, tuple[float, float]]
     successes: int
     episodes: int

@@ -100,8 +100,8 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         `set_options` before `reset` to pass the options `parameters` and `state` of `PerturbEnv.reset`, as one
         dictionary for all environments or as a list of N dictionaries.
 
-        If the options of the environments differ, all environments are reset together first. Then each environment with
-        options is reset again. Without seeds, these environments skip one episode.
+        If the options of the environments differ, all environments are first reset together. Each environment with
+        options is then reset again. If `seed` was not called, these environments thus skip one episode.
         """
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         first, *others = self._options
@@ -159,7 +159,7 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         self.batch.close()
 
     def get_attr(self, attr_name: str, indices: int | Iterable[int] | None = None) -> list[Any]:
-        """Return a list with one copy of an attribute, such as `metadata`, for each selected environment."""
+        """Return an attribute of the batch, such as `metadata`, once for each selected environment."""
         spaces = {"observation_space": "single_observation_space", "action_space": "single_action_space"}
         value = getattr(self.batch, spaces.get(attr_name, attr_name))
         return [value for _ in self._get_indices(indices)]
@@ -225,9 +225,10 @@ class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baseline
     A change takes effect in each environment's next episode.
 
     Args:
-        schedule: a mapping from numbers of steps, of all environments together, to the parameters that apply from this
-            step on. Or a function that gets the number of steps and returns parameters, or None for no change.
-        verbose: 1 prints each change.
+        schedule: a mapping from numbers of steps, counted over all environments together, to the parameters that apply
+            from that number on. Or a function that gets the number of steps and returns parameters, or None for no
+            change.
+        verbose: 1 prints each change of parameters.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ class Set:
         base: the version that all other parameters come from.
         parameters: for each parameter, the intervals [(low, high), …] from which it is drawn for each episode. A fixed
             value is an interval of length 0. Empty for grids and lists.
-        contexts: the contexts of a grid or a list. A context has a value of each parameter that it names, and all
+        contexts: the contexts of a grid or a list. A context is a mapping from names of parameters to values. All
             contexts get the same number of episodes. None if parameters are drawn.
     """
 
@@ -136,7 +136,7 @@ def sampled(
         context = {}
         for parameter in parameters.values():
             intervals = parameter.random if version == "R" else parameter.extreme
-            # A uniform position on the intervals laid end to end.
+            # Draw a position, uniform on all intervals laid end to end, and find the value at that position.
             place = generator.random() * sum(high - low for low, high in intervals)
             for low, high in intervals:
                 if place <= high - low:
@@ -176,7 +176,7 @@ def heatmap(
         InvalidArgumentError: if the environment is unknown, if the number of points is out of range, if a parameter is
             given twice, or if x or y is left out and the environment has no default axes.
     """
-    # The range of each axis is from the lowest to the highest value that R or E draws.
+    # The range of each axis is from the lowest to the highest value that R and E draw.
     known = _environment(environment, task)
     usual = known.heatmap_axes or (None, None)
     axes = (usual[0] if x is None else x, usual[1] if y is None else y)
@@ -220,7 +220,7 @@ def read(path: str | os.PathLike[str]) -> dict[str, Set]:
 def contexts_of(
     chosen: Set, version: requests.Version, parameters: requests.Parameters | None
 ) -> Sequence[Mapping[str, float]]:
-    """Return the contexts of a set, for environments that are constructed with a version and parameters.
+    """Return the contexts of a set, for environments whose constructor also gets `version` and `parameters`.
 
     Raises:
         InvalidArgumentError: if the set has no contexts, if its base is not the version, or if there are parameters.

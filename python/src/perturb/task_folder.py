@@ -31,8 +31,8 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
     """Return the task folder that the argument `task` names, or None if `task` is None.
 
     Raises:
-        InvalidArgumentError: if it is not a task folder, or if `server` is the address of a running server, which
-            serves the tasks that it was started with.
+        InvalidArgumentError: if `task` is not a task folder, or if `server` is the address of a running server. Such a
+            server serves only the tasks that it was started with.
     """
     if task is None:
         return None
@@ -64,16 +64,16 @@ def entry(task: TaskFolder) -> Mapping[str, Any]:
     program = local_server.find_program()
     command = [str(program), "--private", "--log", "error", "--catalogue", "--task", task.path]
     try:
-        told = subprocess.run(command, capture_output=True, timeout=_LIMIT, check=False)
+        finished = subprocess.run(command, capture_output=True, timeout=_LIMIT, check=False)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ServerStartError(f"{program} does not describe task={task.path!r}: {error}") from error
-    words = told.stderr.decode(errors="replace").strip().removeprefix("perturb-server: --task ")
-    if told.returncode == 2:
+    words = finished.stderr.decode(errors="replace").strip().removeprefix("perturb-server: --task ")
+    if finished.returncode == 2:
         raise InvalidArgumentError(f"task={words}")
-    if told.returncode != 0:
-        raise ServerStartError(f"{program} does not describe task={task.path!r}: status {told.returncode}, {words}")
+    if finished.returncode != 0:
+        raise ServerStartError(f"{program} does not describe task={task.path!r}: status {finished.returncode}, {words}")
     known = {known["name"] for known in catalogue.CATALOGUE_ENTRIES}
-    entries = json.loads(told.stdout)["environments"]
+    entries = json.loads(finished.stdout)["environments"]
     own: Mapping[str, Any] = next(own for own in reversed(entries) if own["name"] not in known)
     return own
 
@@ -120,7 +120,7 @@ def describe(
     try:
         return catalogue.find(environment)
     except InvalidArgumentError:
-        # The name may be that of a task that the running server serves.
+        # The name may belong to a task that only the running server knows.
         if server is None or server == EMBEDDED or not isinstance(environment, str):
             raise
         served = _served(server, timeout)
@@ -136,7 +136,7 @@ def _served(server: Address, timeout: float) -> list[Description]:
     The list is empty if the server does not answer. The first request of a session then raises the error.
     """
     try:
-        told = _native.catalogue(str(server), timeout)
+        listed = _native.catalogue(str(server), timeout)
     except _native.Failure:
         return []
-    return [Description.read(served) for served in json.loads(told)["environments"]]
+    return [Description.read(served) for served in json.loads(listed)["environments"]]

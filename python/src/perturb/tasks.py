@@ -96,21 +96,22 @@ def register(folder: str | os.PathLike[str]) -> str:
     `gymnasium.make("perturb/Task-v0", task=folder)`.
 
     Raises:
-        InvalidArgumentError: if it is not a task folder. The message has the reason.
+        InvalidArgumentError: if the folder is not a task folder. The message has the reason.
     """
     task = find_folder(folder)
     assert task is not None
-    told = entry(task)
-    identifier = f"perturb/{told['name']}-v{told['revision']}"
-    gymnasium.registry.pop(identifier, None)  # the id may belong to another folder
-    register_id(identifier, environment=told["name"], task=task.path)
+    described = entry(task)
+    identifier = f"perturb/{described['name']}-v{described['revision']}"
+    gymnasium.registry.pop(identifier, None)  # an earlier call may have registered the id for another folder
+    register_id(identifier, environment=described["name"], task=task.path)
     return identifier
 
 
 def register_ids() -> None:
-    """Register the ids of tasks from folders, for `gymnasium.make` with the argument `task`.
+    """Register ids that `gymnasium.make` accepts together with the argument `task`, the folder of a task.
 
-    `perturb/Task-v0` is for any task. The tasks that this module can write have ids such as `perturb/Walker2dV5-v0`.
+    The id `perturb/Task-v0` accepts a folder with any task. Each task that `from_gymnasium` or `from_dm_control` writes
+    has an id of its own, such as `perturb/Walker2dV5-v0`, which accepts a folder with that task only.
     """
     register_id("perturb/Task-v0")
     for name in GYMNASIUM_TASKS:
@@ -148,7 +149,7 @@ def _assets() -> Path:
 
 
 def _package(name: str) -> Path:
-    """Return the folder of an installed package without importing it, because an import may need MuJoCo."""
+    """Return the folder of an installed package. Do not import the package, because the import may need MuJoCo."""
     found = util.find_spec(name)
     if found is None or not found.submodule_search_locations:
         raise FileNotFoundError(f"the package {name} is missing; install it with: pip install {name}")
@@ -164,7 +165,7 @@ def _licence(package: str) -> str:
     return f"This model is a part of {package}, which has {_LICENCES[package]}\n"
 
 
-# The licence of each package and its address, for an installation without the licence file.
+# The name and address of each package's licence, used if the installed package has no licence file.
 _LICENCES = {
     "gymnasium": "the MIT licence: https://github.com/Farama-Foundation/Gymnasium",
     "dm_control": "the Apache License 2.0: https://github.com/google-deepmind/dm_control",

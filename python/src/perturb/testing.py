@@ -64,8 +64,8 @@ def replay(
         known, records = one.known, one.records
         acts, own_normalizer = given[one.trained_on]
         name = agent if records.policy == agent and not isinstance(acts, Policy) else None
-        # Python judged these records by a rule that may be a function. The function is not stored, so `success` and
-        # `achieved` are not compared.
+        # If Python judged these records, the rule may have been a function, which the records do not contain. Then the
+        # columns `success` and `achieved` are not compared.
         own = success_rules.is_own(records.rule)
         settings = Settings(
             records.environment,
@@ -97,8 +97,8 @@ def _differences(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[st
     wrong = np.flatnonzero(~np.logical_and.reduce(list(same.values())))
     sentences = []
     for row in wrong.tolist():
-        tested_on, *address = (before[name][row] for name in ("set", "environment_index", "episode_index"))
-        where = f"{tested_on}, environment {address[0]}, episode {address[1]}"
+        tested_on, *indices = (before[name][row] for name in ("set", "environment_index", "episode_index"))
+        where = f"{tested_on}, environment {indices[0]}, episode {indices[1]}"
         parts = [f"{name} was {before[name][row]}, is {after[name][row]}" for name in same if not same[name][row]]
         sentences.append(f"{where}: {'; '.join(parts)}")
     return sentences
@@ -114,12 +114,12 @@ def play(
 ) -> tuple[str, PolicyRecords]:
     """Test one policy on all sets. Return the policy's name in reports, and the records of the tests.
 
-    `expected` is the policy's name in the records of tests that are repeated, or None for new tests.
+    If recorded tests are repeated, `expected` is the policy's name in the records. It is None for new tests.
 
     Raises:
         PolicyError: if the policy does not fit the environment, or if its name is not the expected one.
     """
-    # Describe the environment, with the disturbances if a set names one, and prepare the policy for it.
+    # Describe the environment, including the disturbances if a set names a disturbance. Prepare the policy for it.
     environment, observe = settings.environment, settings.observe
     names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
     address = None if settings.server is None else parse_address(settings.server)
@@ -148,7 +148,8 @@ def play(
             "observe": seen,
             "timeout": settings.timeout,
         }
-        # All sets share one table of records. If one set names a disturbance, the others must have them, too.
+        # All sets share one table of records with the same columns. If any set names a disturbance, the sessions of all
+        # sets must have disturbances, so add one that has no effect to a set that names none.
         set_name, version, drawn, contexts = one_set
         if description.is_disturbed and not description.undisturbed.keys() & drawn.keys():
             first, value = next(iter(description.undisturbed.items()))

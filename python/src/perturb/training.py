@@ -124,7 +124,8 @@ def _run(command: list[str], folder: Path | None, episodes: int | None, progress
         InvalidArgumentError: if `perturb train` refuses an argument.
         PerturbError: if the training fails.
     """
-    # The program may start the first perturb-server on PATH, so PATH begins with the folder of this package's server.
+    # The program starts the first perturb-server on PATH if no server is named. PATH begins with the folder of this
+    # package's server, so that the program starts that one.
     environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
     shown = Progress(progress)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from ._native import Stepped
 
 OPTIONS = ("parameters", "state", "reset_mask")
-# A batch with more environments first asks the server whether it accepts them, before it allocates arrays.
+# The constructor of a batch with more environments first asks the server whether it accepts so many. It allocates large
+# arrays only afterwards.
 CHECKED_ENVIRONMENTS = 100_000
 
 
@@ -128,10 +129,10 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._encode = partial(requests.actions, description=description, shape=self.action_space.shape or ())
         self._reward_terms = reward_terms
-        # Parameters that take effect in the next episode, by slot.
+        # The parameters that `set_parameters` set for an environment's next episode, by slot.
         self._next_parameters: dict[int, requests.Intervals] = {}
-        # In next-step mode, the mask of environments whose next step is an autoreset. Such a step has no reward and no
-        # reward terms. The mask is updated only if `_keeps_resetting` is true.
+        # In next-step mode, the mask of environments whose next step is an autoreset, which has no reward and no reward
+        # terms. The mask is updated only if `_keeps_resetting` is true, because nothing else needs it.
         self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
         self._keeps_resetting = reward_terms
         self._is_made = True
@@ -186,7 +187,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
             self._resetting[:] = False
         else:
             self._resetting &= ~mask
-        # If a session was just opened and the reset asks for nothing else, its first episodes are the result.
+        # A new session has begun its first episodes. They are the result of this reset, unless the reset has a seed or
+        # states, or changes parameters.
         waiting = any(slot in self._next_parameters for slot in selected)
         if opened is not None and first is None and not (parameters or states or waiting):
             return opened.observations, opened.events.batch(None, False)
@@ -200,8 +202,9 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         parameters: requests.Intervals,
         states: bytes,
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begin the next episodes of the selected environments. Equal resets share one request."""
-        # Positions in `selected`, grouped by whether there is a seed and by the parameters that change.
+        """Begin the next episodes of the selected environments, with one request for each group of similar resets."""
+        # Positions in `selected`, in groups. The environments of a group all have a seed or all have none, and change
+        # the same parameters.
         alike: dict[Any, list[int]] = {}
         for place, slot in enumerate(selected):
             own = self._next_parameters.get(slot)
@@ -302,10 +305,10 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Restore M snapshots into the environments that the mask [N] selects, by default all.
 
-        Returns the observations [N, O]. Restored environments have the observations at which they were saved, and the
-        others have their last ones. The same actions then give the same bytes as after the snapshot. If one snapshot
-        cannot be restored, no environment changes. Snapshots of more than 32 MiB are restored in parts: if one part is
-        refused, those before it stay restored.
+        Returns the observations [N, O]. Restored environments have the observations at which they were saved. Other
+        environments have their last observations. The same actions then give the same bytes as after the snapshot. If
+        one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in total are restored in parts: if
+        one part is refused, the snapshots of the parts before it stay restored.
         """
         selected = None
         if mask is not None:
@@ -331,7 +334,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
 
     def close_extras(self, **kwargs: Any) -> None:  # noqa: ARG002
         """Free the environments on the server."""
-        # If the constructor raised an error, there is no client. Older versions of Gymnasium close the object anyway.
+        # Older versions of Gymnasium close the batch even if its constructor raised an error. Then there is no client.
         if hasattr(self, "_client"):
             self._client.close()
 

@@ -1,4 +1,5 @@
-//! Exchange of requests and replies. Only one thread at a time, in the process that opened the stream, can do it.
+//! Exchange of requests and replies. Only the process that opened the session can use it, and only one of its threads
+//! at a time.
 
 use std::pin::pin;
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -33,7 +34,7 @@ pub(super) enum SessionState {
     Ended,
 }
 
-/// An open session. The transport is dropped before the runtime that drives it.
+/// An open session. Fields are dropped in order: the transport before the runtime, because the runtime drives it.
 pub(super) struct OpenSession {
     pub(super) transport: Transport,
     pub(super) runtime: SessionRuntime,
@@ -57,12 +58,13 @@ impl Session {
         if mask.is_empty() { self.actions.num_envs } else { mask.iter().filter(|&&selected| selected != 0).count() }
     }
 
-    /// Checks that this process made the session. A forked process must not use the session of its parent, whose locks
-    /// may be held forever.
+    /// Checks that this process made the session. A forked process must not use the session of its parent: if another
+    /// thread held one of the session's locks during the fork, the lock is never released in the forked process.
     pub(super) fn require_own(&self) -> PyResult<()> {
         let is_own = match self.server {
             SessionServer::Address(..) => std::process::id() == self.owner,
-            // The system call for the process's id would take a tenth of the time of a small step.
+            // Compare the number of forks, not the process's id. The system call for the id would take a tenth of the
+            // time of a small step.
             SessionServer::Embedded(_) => self.forks == FORKS.load(Ordering::Relaxed),
         };
         if is_own {
@@ -71,8 +73,8 @@ impl Session {
         Err(failure(UNUSABLE, 0, "another process opened the session"))
     }
 
-    /// Takes the open session for this thread. Fails if more than `max_under_way` steps are under way, i.e. were sent
-    /// and not received.
+    /// Takes the open session for this thread, and marks it as busy. Fails if more than `max_under_way` steps were sent
+    /// and not yet received.
     pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<OpenSession>> {
         self.require_own()?;
         let mut state = self.state();
@@ -134,7 +136,7 @@ impl Session {
 
     /// Sends a request and receives its reply. `None` sends nothing, and receives the reply to the oldest step that was
     /// sent and not received. If the server refuses the request, the session can be used further. All other errors end
-    /// it.
+    /// the session.
     fn exchange<A>(
         &self,
         py: Python<'_>,
@@ -148,8 +150,9 @@ impl Session {
         let busy = BusyGuard(self);
         let OpenSession { transport, runtime, labels, .. } = &mut *open;
         let labels = Arc::clone(labels);
-        // Two separate futures, because a common one would have the size of the larger and would have to be moved.
-        let come = match transport {
+        // Each transport has its own future. A common future type would have the size of the larger one, and would have
+        // to be moved.
+        let outcome = match transport {
             Transport::Stream { stream, .. } => {
                 let pending = pin!(Transport::exchange(stream, request));
                 runtime.wait(py, pending, self.deadline(), &self.closing)
@@ -157,12 +160,12 @@ impl Session {
             Transport::Embedded(stream) => {
                 let mut pending = pin!(stream.exchange(request));
                 match runtime.now(py, || poll_once(pending.as_mut())) {
-                    Some(come) => Ok(come),
+                    Some(output) => Ok(output),
                     None => runtime.wait(py, pending, self.deadline(), &self.closing),
                 }
             }
         };
-        match come {
+        match outcome {
             Ok(Ok(reply)) => {
                 std::mem::forget(busy);
                 self.put_back(py, open);
@@ -175,7 +178,8 @@ impl Session {
             }
             Ok(Err(RequestFailure::Ended(error))) => Err(error),
             Err(broken) => {
-                // The late reply would be taken for the reply to the next request.
+                // The wait ended before the reply came. If the session continued, the late reply would be taken for the
+                // reply to the next request.
                 open.close(py);
                 Err(explain(broken))
             }
@@ -186,8 +190,8 @@ impl Session {
 impl Drop for Session {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
-            // This session is a fork's copy of the parent's session. It is not dropped, because its locks may be held
-            // forever, and because its connection belongs to the parent.
+            // This process was forked, and the session is a copy of the parent's session. Leak it, because its locks
+            // may be held forever, and because its connection belongs to the parent.
             let state = self.state.get_mut().unwrap_or_else(PoisonError::into_inner);
             std::mem::forget(std::mem::replace(state, SessionState::Ended));
         }
@@ -209,8 +213,8 @@ impl OpenSession {
     }
 }
 
-/// A guard that ends a busy session when the guard is dropped, also by a panic, so that no session stays busy for ever.
-/// If the session continues, the caller passes the guard to [`std::mem::forget`].
+/// A guard of a busy session. When the guard is dropped, also by a panic, it ends the session, so that no session stays
+/// busy for ever. If the session continues, the caller passes the guard to [`std::mem::forget`].
 pub(super) struct BusyGuard<'a>(pub(super) &'a Session);
 
 impl Drop for BusyGuard<'_> {

@@ -60,7 +60,8 @@ impl SessionServer {
     }
 }
 
-/// The transport of an open session's requests and replies. A stream is dropped before its connection.
+/// The transport of an open session's requests and replies. The field order ensures that a stream is dropped before its
+/// connection.
 #[allow(clippy::large_enum_variant)] // each session has only one transport
 pub(super) enum Transport {
     Stream {
