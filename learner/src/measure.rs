@@ -122,11 +122,11 @@ fn measure_one(
     };
     let cells: Vec<Cell> = group.iter().map(endless).collect();
     let folder = Folder::new(scratch);
-    let order = |cell| CellJob { cell, folder: folder.cell(&cell.id), retry: None };
-    let orders: Vec<CellJob<'_>> = cells.iter().map(order).collect();
+    let job = |cell| CellJob { cell, folder: folder.cell(&cell.id), retry: None };
+    let jobs: Vec<CellJob<'_>> = cells.iter().map(job).collect();
     let enough = StopFlag::default();
     let mut meter = SpeedMeter::new();
-    run_cells(servers, &orders, &enough, &mut |cell, event| {
+    run_cells(servers, &jobs, &enough, &mut |cell, event| {
         if meter.on_event(&cell.id, event) >= limit || stop.signal().is_some() {
             enough.raise(1);
         }

@@ -330,7 +330,7 @@ impl CellFolder {
         self.path.join("marks").join(mark.to_string())
     }
 
-    /// Returns the path of the worker's log.
+    /// Returns the path of the log with the warnings of the worker process that ran the cell.
     pub fn log(&self) -> PathBuf {
         self.path.join("log.txt")
     }

@@ -120,7 +120,8 @@ impl<'a> ClientSide<'a> {
         self.lanes.iter_mut().find(|lane| lane.index == index)
     }
 
-    /// Frees the slots of a run that has ended or failed, and renumbers the slots behind them.
+    /// Frees the slots of a run that has ended or failed. Runs with higher slots get lower slots, so that no gap
+    /// remains.
     fn release_slots(&mut self, slots: Range<usize>) -> Result<()> {
         if self.lanes.is_empty() {
             return Ok(()); // the whole session is closed soon

@@ -73,8 +73,8 @@ pub struct RunFolders {
 }
 
 /// Finds runs in `folder` and its subfolders. Searches at most `most` folders, each once. Follows symbolic links after
-/// it has searched all other folders. If `within` is given, an absolute path without links, does not follow links that
-/// lead out of it.
+/// it has searched all other folders. If `within` is given, does not follow links that lead out of this folder.
+/// `within` must be an absolute path without links.
 ///
 /// # Errors
 /// Errors of the operating system if `folder` itself cannot be listed. Skips other folders that cannot be listed.
@@ -105,7 +105,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
             found.more = true;
             break;
         }
-        // A run is not searched for further runs. Any other folder is.
+        // A folder that contains a run is not searched for further runs. Any other folder is searched.
         if let Some(kind) = RunKind::detect(&path) {
             found.runs.push(RunFolder { path, kind });
             continue;

@@ -82,9 +82,9 @@ impl<'a> Local<'a> {
             Ok((spawned.map_err(failed)?, events))
         };
         let (mut child, events) = start().map_err(io("start a worker process of", &program))?;
-        let order = WorkerJob { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
+        let job = WorkerJob { cells, turn: self.first_turn().wrapping_add(first.group + first.lost_servers) };
         if let Some(input) = &mut child.stdin {
-            write_line(input, &order);
+            write_line(input, &job);
         }
         let cells = group.iter().map(|offer| (self.id(offer.cell).to_owned(), offer.cell)).collect();
         Ok(Some(Worker { cells, begun: HashSet::new(), slot, child, events, offset: 0, log: path, log_start }))

@@ -23,8 +23,8 @@ const TICK: Duration = Duration::from_millis(20);
 const FIELDS: &str = "%F|%K|%T|%r|%N|%j";
 /// Separator of the fields in a line of squeue.
 const SEPARATOR: char = '|';
-/// Prefix of heading lines in squeue's output. With several clusters, squeue prints one above each cluster's jobs, even
-/// with --noheader.
+/// Prefix of heading lines in squeue's output. With several clusters, squeue prints a heading above each cluster's
+/// jobs, even with --noheader.
 const CLUSTER_HEADING: &str = "CLUSTER:";
 
 /// The commands of the Slurm installation on this machine.
