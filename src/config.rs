@@ -1,5 +1,5 @@
-//! The server's configuration. Its sources, each of which overrides the previous: defaults, a TOML file, environment
-//! variables, command-line flags.
+//! The server's configuration. Its sources are defaults, a TOML file, environment variables and command-line flags.
+//! Each source overrides the sources before it.
 
 use clap::Parser;
 use config::{Environment, File, FileFormat};
@@ -17,7 +17,7 @@ const ENV_PREFIX: &str = "PERTURB_SERVER";
 /// The maximum of timeouts and intervals, s: one day. The transport adds them to the present time, which must not
 /// overflow.
 const MAX_SECONDS: u64 = 86_400;
-/// The minimum of `max_memory`, bytes. Pictures need more.
+/// The minimum of `max_memory`, bytes. A server that draws pictures needs more.
 const MIN_MEMORY: usize = 1 << 20;
 /// The number of cores for each transport thread, by default. It is high because physics needs most of the cores.
 const CORES_PER_TRANSPORT_THREAD: usize = 8;
@@ -25,8 +25,9 @@ const CORES_PER_TRANSPORT_THREAD: usize = 8;
 const MAX_TRANSPORT_THREADS: usize = 128;
 /// The maximum length of the configuration file, bytes.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
-/// The settings of `--private`. They remove the limits, which protect only shared servers. Timeouts are long because
-/// the program may compute for long between two steps; if it dies, its socket and pipe are closed anyway.
+/// The settings of `--private`. They remove the limits, which protect only shared servers. Timeouts are long, because
+/// the program that started the server may compute for long between two steps. If this program dies, its socket and
+/// pipe are closed without a timeout.
 const PRIVATE: &str = "
     exit_with_stdin = true
     transport_threads = 1
@@ -355,7 +356,7 @@ fn is_service_link(name: &str, value: &str) -> bool {
     let Some(rest) = name.strip_prefix(ENV_PREFIX) else { return false };
     let is_number = |text: &str| !text.is_empty() && text.bytes().all(|byte| byte.is_ascii_digit());
     let is_port = |rest: &str| {
-        // `NUMBER_PROTOCOL`, optionally followed by `_PROTO`, `_PORT` or `_ADDR`.
+        // Kubernetes' names continue with `NUMBER_PROTOCOL`, optionally followed by `_PROTO`, `_PORT` or `_ADDR`.
         let mut parts = rest.split('_');
         parts.next().is_some_and(is_number)
             && parts.next().is_some_and(|protocol| matches!(protocol, "TCP" | "UDP" | "SCTP"))
@@ -585,8 +586,8 @@ impl Config {
         Ok(self)
     }
 
-    /// Returns the filter of log lines. If the setting is a level, it applies to this program's own lines. Most lines
-    /// of its libraries are caused by what clients send, so only their errors are logged.
+    /// Returns the filter of log lines. If the setting is a level, the level applies to this program's own lines. Of
+    /// its libraries, only errors are logged, because most other lines of libraries are caused by data from clients.
     pub fn filter(&self) -> Targets {
         match self.log.parse::<LevelFilter>() {
             Ok(level) => Targets::new().with_default(level.min(LevelFilter::ERROR)).with_target("perturb", level),

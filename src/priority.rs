@@ -3,8 +3,8 @@
 use std::sync::OnceLock;
 
 /// Lowers the priority of the calling thread: sets its niceness to the process's niceness plus `by`. If the system
-/// refuses, only logs that. The first call in the process reads the process's niceness, so it must come from a thread
-/// whose niceness has not been changed.
+/// refuses, the priority stays, and the refusal is logged. The first call in the process reads the process's niceness,
+/// so it must come from a thread whose niceness has not been changed.
 pub(crate) fn lower(by: i32) {
     static NICENESS: OnceLock<i32> = OnceLock::new();
     let niceness = *NICENESS.get_or_init(|| rustix::process::getpriority_process(None).unwrap_or(0));

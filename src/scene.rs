@@ -178,7 +178,7 @@ pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
 pub struct PosedModel {
     /// The model and how it is drawn; the same for all pictures of the environment.
     pub look: &'static Look,
-    /// The edited MJCF, if the episode's lengths differ from those of the original model.
+    /// The edited MJCF; `None` if the episode's lengths are those of the original model.
     pub edited: Option<String>,
     /// The generalised positions, `[Q]`.
     pub qpos: Vec<f64>,
@@ -225,7 +225,7 @@ pub enum ModelView {
         /// The height that the camera looks at, m.
         height: f64,
     },
-    /// The camera of the model with this number.
+    /// The camera with this index among the model's own cameras.
     Camera(usize),
     /// A camera that looks at a point.
     Placed {
@@ -237,7 +237,7 @@ pub enum ModelView {
         azimuth: f64,
         /// The vertical direction of view, as an angle above the horizon; negative if the camera looks down, degrees.
         elevation: f64,
-        /// The number of the body with which the point moves; `None` for a fixed point.
+        /// The index of the body with which the point moves; `None` for a fixed point.
         followed: Option<usize>,
     },
 }

@@ -35,7 +35,7 @@ fn main() -> ExitCode {
     let _ = perturb_system::ignore_sigxfsz(); // if this fails, the only loss is that a file-size limit ends the program
     let arguments = Arguments::parse();
     if let Some(page) = requested_text(&arguments) {
-        // Ignored: the reader may close the pipe early.
+        // An error is ignored, because the reader may close the pipe early.
         let _ = io::stdout().write_all(&page);
         return ExitCode::SUCCESS;
     }
@@ -147,8 +147,8 @@ impl<E: Into<Box<dyn Error>>> From<E> for Failure {
     }
 }
 
-/// Removes the empty folders that contained a private server's sockets, because the program that made them may have
-/// been killed. Folders with files are kept.
+/// Removes the empty folders that contained a private server's sockets, because the program that made the folders may
+/// have been killed before it could remove them. Folders with files are kept.
 fn remove_folders(config: &Config) {
     for address in &config.listen {
         if let ListenAddress::Unix(path) = address {
@@ -228,7 +228,7 @@ fn check(config: &Config) -> Result<(), Failure> {
     environments(config, true).map(|_| ())
 }
 
-/// Loads a folder under limits of memory and CPU time, and prints its description.
+/// Loads a folder within limits of memory and CPU time, and prints its description. This process was started for that.
 #[cfg(feature = "mujoco")]
 fn check_task(path: &std::path::Path, measured: bool) -> ExitCode {
     let report = folder::child::limit_this_process()
@@ -274,7 +274,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         };
         for address in &config.listen {
             let listener = Listener::bind(address, config.socket_mode).await.map_err(Failure::setting)?;
-            // Ignored: the program that started the server may have closed the pipe.
+            // An error is ignored, because the program that started the server may have closed the pipe.
             let _ = writeln!(io::stdout(), "listening on {}", client_address(&listener.address()?, config));
             listeners.push(listener);
         }
@@ -289,7 +289,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
         server::run(listeners, metrics, config, &security, environments.catalogue.clone(), shutdown).await?;
         Ok(())
     });
-    // Does not wait for connections that are still open.
+    // The program does not wait for connections that are still open.
     runtime.shutdown_background();
     result
 }
@@ -298,7 +298,7 @@ fn run(config: &Config, environments: &Environments) -> Result<(), Failure> {
 fn client_address(address: &ListenAddress, config: &Config) -> String {
     match address {
         ListenAddress::Tcp(tcp) if config.tls_cert.is_some() => format!("https://{tcp}"),
-        // Absolute, because a client may have another working directory.
+        // The path is made absolute, because a client may have another working directory.
         ListenAddress::Unix(path) => {
             ListenAddress::Unix(std::path::absolute(path).unwrap_or_else(|_| path.clone())).to_string()
         }
@@ -349,9 +349,9 @@ fn health(config: &Config) -> Result<(), Failure> {
 /// Resolves at SIGTERM or SIGINT, or, if `exit_with_stdin`, when standard input closes. A second signal exits
 /// immediately.
 ///
-/// SIGUSR1, SIGUSR2 and SIGXCPU, by which batch systems and the kernel warn, resolve it too, and do not count as a
-/// second signal. If `exit_with_stdin`, they are ignored: the program that started the server may get them too, and
-/// then needs the server to save its work.
+/// Batch systems and the kernel warn of a limit by SIGUSR1, SIGUSR2 or SIGXCPU. The first warning also resolves the
+/// future, but does not count as one of the two signals that exit immediately. If `exit_with_stdin`, warnings are
+/// ignored: the program that started the server may get the same warning, and then needs the server to save its work.
 fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (mut user_1, mut user_2) = (signal(SignalKind::user_defined1())?, signal(SignalKind::user_defined2())?);
@@ -361,7 +361,7 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
         std::thread::Builder::new()
             .name("stdin".into())
             .spawn(move || {
-                // The input is ignored. Its end, or an error, is the signal.
+                // The content of the input is ignored. The end of the input, or an error, starts the shutdown.
                 let _ = io::copy(&mut io::stdin().lock().by_ref(), &mut io::sink());
                 drop(closed);
             })
@@ -379,7 +379,8 @@ fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
             _ = stdin => false,
         };
         tokio::spawn(async move {
-            // A batch system sends SIGTERM after its warning, and sessions keep their grace period then.
+            // A batch system sends SIGTERM after its warning. This first SIGTERM must not exit at once, so that
+            // sessions keep their grace period.
             for _ in 0..=usize::from(is_warning) {
                 tokio::select! {
                     _ = terminate.recv() => {}

@@ -33,7 +33,8 @@ struct Canvas {
 }
 
 impl Canvas {
-    /// Creates a blank picture. The rectangle from `low` to `high` is in its middle, and as large as fits.
+    /// Creates a blank picture. The rectangle from `low` to `high` is in the middle of the picture, and as large as
+    /// fits.
     fn new(size: Size, low: Point, high: Point) -> Self {
         let (width, height) = (f64::from(size.width), f64::from(size.height));
         let mut pixmap = Pixmap::new(size.width.into(), size.height.into()).expect("sizes are at least 16");

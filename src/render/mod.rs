@@ -135,7 +135,8 @@ impl Drop for Renderer {
         let running = self.thread.get_mut().unwrap_or_else(PoisonError::into_inner);
         if let Some(DrawingThread { jobs, handle }) = running.take() {
             jobs.close();
-            // The driver should not draw while the process ends. But a driver that hangs must not block the end.
+            // Waits for the thread, because the graphics driver should not draw while the process ends. The wait is
+            // limited, because a driver may hang.
             for _ in 0..SHUTDOWN_TIMEOUT.as_millis() {
                 if handle.is_finished() {
                     break;

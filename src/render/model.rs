@@ -2,7 +2,8 @@
 //!
 //! The models that run the physics have no colours, textures and lights, which would make each simulation larger. So
 //! pictures show a second model: the same MJCF with scenery added. The second model gets the positions of the physics.
-//! If parameters edit lengths, it also gets these lengths. Other parameters (power, density, friction) are not visible.
+//! If parameters edit lengths, the second model also gets the edited lengths. Other parameters (power, density,
+//! friction) are not visible.
 
 use super::{Error, Size};
 use crate::scene::{Look, ModelView, PosedModel, Scenery};
@@ -10,7 +11,7 @@ use perturb_mujoco::{self as mujoco, Camera, Kind};
 use std::ptr;
 
 const END_OF_MODEL: &str = "</mujoco>";
-/// Height in m by which a robot may rise or sink before the camera follows. It makes hops visible.
+/// Height in m by which a robot may rise or sink before the camera follows. So hops of the robot are visible.
 const FREE_RISE: f64 = 0.6;
 
 /// The models that were drawn so far, reused for later pictures.

@@ -7,7 +7,7 @@ use std::{
     sync::{Condvar, Mutex, MutexGuard, PoisonError},
 };
 
-/// Length of the queue at which each `push` first removes abandoned entries.
+/// Length of the queue at which each `push` first removes the pictures that nobody waits for any more.
 const MIN_CLEANUP_LENGTH: usize = 256;
 
 /// A fair queue of entries, each with a number of pixels as its cost. It may be used by several threads.
@@ -17,8 +17,8 @@ pub(super) struct Turns<T> {
 }
 
 struct Queue<T> {
-    /// The entries with their numbers of pixels. The key is the value of `clock` at which the entry is due, then its
-    /// number of arrival.
+    /// The entries with their numbers of pixels. The key has the value of `clock` at which the entry is due, then the
+    /// number of the entry in the order of arrival.
     waiting: BTreeMap<(u64, u64), (u64, T)>,
     /// The virtual time of fair queueing: the number of pixels of each waiting entry that simultaneous drawing would
     /// have finished by now.
@@ -47,7 +47,7 @@ impl<T> Turns<T> {
         self.ready.notify_one();
     }
 
-    /// Waits for the next entry and returns it. Returns `None` once the queue is closed.
+    /// Waits for the next entry and returns it. Returns `None` if the queue is closed.
     pub(super) fn pop(&self) -> Option<T> {
         let mut queue = self.lock();
         loop {

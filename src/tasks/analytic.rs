@@ -12,8 +12,8 @@ pub(super) fn choice(action: Action<'_>) -> u32 {
     }
 }
 
-/// Sets `state` to `next`, the result of the dynamics. If `next` is not finite as f32, keeps the previous state and
-/// returns true: the dynamics diverged. Extreme parameters or states can cause this.
+/// Sets `state` to `next`, the result of the dynamics. If `next` is not finite as f32, the dynamics diverged: keeps the
+/// previous state and returns true. Extreme parameters or states can cause a divergence.
 pub(super) fn advance<const N: usize>(state: &mut [f64; N], next: [f64; N]) -> bool {
     let diverged = !observable(&next);
     if !diverged {
@@ -26,8 +26,8 @@ fn observable(state: &[f64]) -> bool {
     state.iter().all(|&x| (x as f32).is_finite())
 }
 
-/// Checks a saved state: it must have exactly `N` finite numbers, each with an absolute value up to the limit in
-/// `most`.
+/// Checks a saved state and returns it. It must have exactly `N` finite numbers. The absolute value of each number must
+/// not exceed its limit in `most`.
 pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
         Ok(state) if !observable(&state) => Err(Error::Snapshot { reason: "its state is not finite".into() }),

@@ -8,7 +8,7 @@
 use perturb_mujoco::{Error, Model, Simulation};
 use std::{any::Any, cell::RefCell, ptr, sync::Arc};
 
-/// A compiled model, which is never modified, and how an edit is applied to a simulation of it.
+/// A compiled model, which is never modified, and the way in which an edit is applied to a simulation of it.
 pub(super) trait SharedModel: Sync + 'static {
     /// An edit of the model: parameters, and the values in the model that follow from them.
     type Edit: Send + Sync + 'static;
@@ -20,7 +20,7 @@ pub(super) trait SharedModel: Sync + 'static {
     fn is_same(a: &Self::Edit, b: &Self::Edit) -> bool;
 
     /// Applies an edit to the model of a simulation. `before` is the edit that the simulation's model has now; `None`
-    /// if it is not known.
+    /// if this edit is not known.
     ///
     /// # Errors
     /// MuJoCo's fatal errors.
@@ -72,8 +72,9 @@ pub(super) fn with<T: SharedModel, R>(
 }
 
 impl<T: SharedModel> Shared<T> {
-    /// Returns the edit that the simulation has now, if `is_wanted` returns true for it. Otherwise calls `make`, which
-    /// applies a new edit to the simulation and returns it. The state is undefined afterwards.
+    /// Returns the edit that the simulation has now, if `is_wanted` returns true for this edit. Otherwise calls `make`,
+    /// which applies a new edit to the simulation and returns the new edit. The state of the simulation is undefined
+    /// afterwards.
     ///
     /// # Errors
     /// The errors of `make`.
@@ -91,7 +92,7 @@ impl<T: SharedModel> Shared<T> {
         Ok(edit)
     }
 
-    /// Applies an edit, and returns the simulation with the edited model. Its state is undefined.
+    /// Applies an edit, and returns the simulation with the edited model. The state of the simulation is undefined.
     ///
     /// # Errors
     /// MuJoCo's fatal errors.

@@ -6,13 +6,13 @@ use std::f64::consts::FRAC_PI_2;
 
 const LINK: f64 = 0.2;
 
-/// Draws the links. `angles` are in rad, anticlockwise: of the first link from hanging down, of the second relative to
-/// the first. `link_length` is in m.
+/// Draws the links. `angles` are the angle of link 1 from hanging down and the angle of link 2 relative to link 1, in
+/// rad, anticlockwise. `link_length` is in m.
 pub(super) fn drawing(angles: [f64; 2], link_length: f64) -> Drawing {
     let half = (2.2 * link_length).max(3.3); // the longest links of version E fit
     let mut drawing = Drawing::new([-half, -half], [half, half]);
 
-    // The task's goal is a sum of cosines, so its unit is the length of a link.
+    // The task compares a sum of two cosines with `HEIGHT`, so the unit of `HEIGHT` is the length of a link.
     let goal_height = HEIGHT * link_length;
     drawing.rectangle([f64::NEG_INFINITY, goal_height], [f64::INFINITY; 2], colour::PALE_GREEN);
     drawing.dashes(&[[f64::NEG_INFINITY, goal_height], [f64::INFINITY, goal_height]], 0.05, colour::GREEN);

@@ -137,7 +137,7 @@ impl Default for Acrobot {
 }
 
 /// Wraps an angle in rad into [-π, π]. Like Gymnasium it adds or subtracts 2π in a loop, because a remainder would
-/// round differently. Angles so large that the loop could take too long, which extreme parameters can cause, are
+/// round differently. Extreme parameters can cause angles so large that the loop would take too long. Such angles are
 /// wrapped by a remainder.
 fn wrap(mut angle: f64) -> f64 {
     if angle.abs() > 1000.0 * PI {

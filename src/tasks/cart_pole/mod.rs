@@ -84,8 +84,8 @@ pub struct CartPole {
     force: f64,
     half_pole_length: f64,
     pole_mass: f64,
-    // Quantities that `set_parameters` derives. The reciprocal saves three divisions, half of a step's time. Results
-    // differ from Gymnasium's by some 1e-16.
+    // Quantities that `set_parameters` derives. The reciprocal saves three divisions in each step, which would take
+    // half of a step's time. It makes results differ from Gymnasium's by some 1e-16.
     pole_mass_length: f64,
     inverse_total_mass: f64,
     /// The cart's position in m and velocity in m/s, the pole's angle from upright in rad and angular velocity in

@@ -38,12 +38,13 @@ impl<'a, 'input> ModelText<'a, 'input> {
         nested.chain(top).find_map(of_class)
     }
 
-    /// Returns an attribute of the `<compiler>` element.
+    /// Returns an attribute of the model's `<compiler>` elements; the last element that has it counts.
     pub(super) fn compiler(self, key: &str) -> Option<&'a str> {
         self.elements("compiler").filter_map(|node| node.attribute(key)).last()
     }
 
-    /// Returns the `<inertial>` element of a body. `None` if there is none, or if the compiler is set to ignore it.
+    /// Returns the `<inertial>` element of a body. Returns `None` if the body has none, or if the compiler is set to
+    /// ignore such elements.
     pub(super) fn inertial(self, body: Node<'a, 'input>) -> Option<Node<'a, 'input>> {
         let inertial = body.children().find(|child| child.has_tag_name("inertial"));
         inertial.filter(|_| self.compiler("inertiafromgeom") != Some("true"))
@@ -57,8 +58,8 @@ impl<'a, 'input> ModelText<'a, 'input> {
         is_mesh && has_inertia && is_zero("contype") && is_zero("conaffinity")
     }
 
-    /// Whether the text of the physics can omit a geom: it affects only pictures, and has no name by which a task could
-    /// refer to it.
+    /// Whether the text for the physics can omit a geom. The geom must affect only pictures, and must have no name by
+    /// which a task could refer to it.
     pub(super) fn is_left_out(self, geom: Node<'a, 'input>) -> bool {
         !geom.has_attribute("name") && self.is_shown_only(geom)
     }

@@ -17,7 +17,7 @@ const ROLL_DIMENSION: i32 = 6;
 /// Checks that each edit of a parameter can change the physics.
 ///
 /// # Errors
-/// [`super::Error`] with the parameter and the reason, if an edit cannot.
+/// [`super::Error`] with the parameter and the reason, if an edit cannot change the physics.
 pub(super) fn check(
     tables: &[Table<'_>],
     parameters: &[EditedParameter],
@@ -70,7 +70,7 @@ fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[Edited
     Ok(())
 }
 
-/// Refuses edits of a part of the physics, such as contacts, that the model's flags switch off.
+/// Refuses edits of a part of the physics, such as contacts, if the model's flags switch this part off.
 fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
     let flags = model.options().disable_flags;
     let (bits, what) = match (edit.targets.subject, edit.targets.field) {
@@ -124,7 +124,7 @@ fn friction(
     field: &str,
 ) -> Result<()> {
     let geoms = &edit.targets.ids;
-    // The geoms must have contacts, and the contacts must have this kind of friction.
+    // The edited geoms must have possible contacts, and the contacts must have the edited kind of friction.
     let contacts: Vec<Contact> = geoms.iter().flat_map(|&geom| contacts_of(model, geom)).collect();
     if contacts.is_empty() {
         let name = escaped(edit.targets.names.first().map_or("", String::as_str));
@@ -149,7 +149,7 @@ fn friction(
             ),
         ));
     }
-    // The comparison below skips other geoms whose friction is also edited.
+    // The indices of all edited frictions. The comparison below skips other geoms whose friction is edited, too.
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)
@@ -195,7 +195,7 @@ fn friction(
     }))
 }
 
-/// Returns the smallest number that an edit can write into the model. It is reached at one of the parameter's bounds.
+/// Returns the smallest number that an edit can write into the model. The parameter has one of its bounds then.
 fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     let bounds = parameter.parameter.bounds;
     let numbers = edit
@@ -224,7 +224,7 @@ pub(super) fn can_touch(model: &Model, geom: usize) -> bool {
 
 /// Returns the possible contacts of a geom with other geoms. Leaves out the pairs that the model declares.
 fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
-    // The value 1 means that only declared pairs can touch.
+    // The value 1 of the option `collision` means that only declared pairs can touch.
     if model.options().collision == 1 {
         return Vec::new();
     }
@@ -239,7 +239,7 @@ fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
     let weld_of = |geom: usize| weld[body[geom] as usize];
     let can_touch = |&other: &usize| {
         let (own, its) = (weld_of(geom), weld_of(other));
-        // Bodies that are welded together count as one body. This is the parent of such a body.
+        // Bodies that are welded together count as one body. `parent_of` returns the parent of such a body.
         let parent_of = |body: i32| weld[parent[body as usize] as usize];
         let fits = contact_type[geom] & affinity[other] != 0 || contact_type[other] & affinity[geom] != 0;
         let related = own != 0 && its != 0 && (parent_of(own) == its || parent_of(its) == own);

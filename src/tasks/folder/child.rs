@@ -33,7 +33,7 @@ pub fn limit_this_process() -> io::Result<()> {
     let limit = |resource, most: u64| setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
     limit(Resource::As, MAX_MEMORY_BYTES)?;
     limit(Resource::Cpu, MAX_CPU_SECONDS)?;
-    // Without this limit a crash could leave a core file of two gigabytes.
+    // Without this limit, a crash of the process could leave a core file of two gigabytes.
     limit(Resource::Core, 0)?;
     Ok(())
 }
@@ -42,7 +42,8 @@ pub fn limit_this_process() -> io::Result<()> {
 /// `perturb-server`. If `measured`, the report includes the speed of the environment.
 ///
 /// # Errors
-/// [`LoadError`] with the error that the process printed. If it printed none, with the way in which it ended.
+/// [`LoadError`] with the error that the process printed. If the process printed no error, [`LoadError`] says in which
+/// way the process ended.
 pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, LoadError> {
     let refuse = |problem: String| LoadError::new(folder, problem);
     let mut child = Command::new(program)
@@ -110,8 +111,8 @@ fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
     Ok(None)
 }
 
-/// Starts a thread that reads an output of a process to its end. It returns the first [`MAX_OUTPUT_BYTES`] bytes as
-/// text.
+/// Starts a thread that reads an output of a process to its end. The thread returns the first [`MAX_OUTPUT_BYTES`]
+/// bytes as text.
 fn collect(stream: Option<impl Read + Send + 'static>) -> thread::JoinHandle<String> {
     thread::spawn(move || {
         let mut kept = Vec::new();

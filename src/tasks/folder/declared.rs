@@ -27,7 +27,8 @@ impl Push {
     /// Reads the table `push`. The default is the first body that can move, pushed along x and y. Returns `None` if no
     /// body can move.
     pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Option<Self>> {
-        // For each body the index of the body to which it is fixed, or its own; 0 is the world.
+        // For each body, the index of the topmost body to which it is rigidly fixed, possibly its own index. Index 0 is
+        // the world.
         let fixed_to = model.index_array(Index::BodyWeld);
         let mut body = (1..model.n_body()).find(|&body| fixed_to[body] != 0);
         let mut axes: &'static [usize] = &[0, 1];
@@ -58,8 +59,8 @@ impl Push {
     }
 }
 
-/// Reads the table `disturbances`, whose keys are names of disturbances. Returns each with its values in versions R and
-/// E.
+/// Reads the table `disturbances`, whose keys are names of disturbances. Returns each named disturbance with its values
+/// in versions R and E.
 pub(super) fn read(top: &Table<'_>, spec: &EnvironmentSpec) -> Result<Vec<Parameter>> {
     let Some(value) = top.get("disturbances") else { return Ok(Vec::new()) };
     let table = value.table()?;

@@ -12,7 +12,8 @@ use perturb_mujoco::{Error, Simulation};
 const N_STEPS: usize = 200;
 
 /// Returns the names of the parameters that change nothing in 200 timesteps with random controls from the initial
-/// state. They may have an effect in other states; for instance, friction has none before the robot touches the floor.
+/// state. A returned parameter may have an effect in other states; for instance, friction has none before the robot
+/// touches the floor.
 ///
 /// # Errors
 /// MuJoCo's fatal errors.
@@ -35,7 +36,7 @@ pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
 }
 
 /// Simulates [`N_STEPS`] timesteps with random controls, and returns the bits of all positions and velocities after
-/// each. Stops early if the physics diverge. `values` are the parameters.
+/// each timestep. Stops early if the physics diverge. `values` are the values of the parameters.
 fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
     let edit = task.template.edit(&task.parameters, values)?;
     shared::with(&task.template, |shared| {

@@ -50,8 +50,8 @@ impl Elements {
     }
 
     /// Returns the indices of the elements that `value` names: a name, a pattern with `*` and `?`, or a list of names
-    /// and patterns. They are in the order of the list, and in the model's order within a pattern. A pattern never
-    /// matches the world body.
+    /// and patterns. The indices are in the order of the list, and within a pattern in the model's order. A pattern
+    /// never matches the world body.
     pub(super) fn select(&self, kind: Kind, value: &Value<'_>) -> Result<Vec<usize>> {
         let mut selected = Vec::new();
         for pattern in value.texts()? {
@@ -80,7 +80,7 @@ impl Elements {
     }
 }
 
-/// Returns the name of an actuator. If it has none, returns the name of the joint that it drives.
+/// Returns the name of an actuator. If the actuator has no name, returns the name of the joint that it drives.
 pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize) -> String {
     let name = elements.name(Kind::Actuator, actuator);
     match actuated_joint(model, actuator) {

@@ -20,17 +20,17 @@ use std::sync::Arc;
 
 /// Maximal absolute position or velocity in a saved state. MuJoCo reports divergence above this value.
 const MAX_STATE: f64 = 1e10;
-/// The message of an `expect`, which states why it cannot fail. If it fails anyway, the worker's panic ends its batch,
-/// but not the server.
+/// The message of an `expect` that cannot fail; the message states why. If the `expect` fails anyway, the worker's
+/// panic ends its batch, but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 /// The time at which MuJoCo computes the poses that a step's readings use.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Poses {
-    /// Before the last timestep of the step, when MuJoCo computes the poses anyway. With the integrator RK4, in the
-    /// last stage of that timestep.
+    /// MuJoCo computes the poses at the start of the step's last timestep, as part of the simulation. With the
+    /// integrator RK4, the poses are those of the timestep's last stage.
     Before,
-    /// After the step, by an additional computation.
+    /// MuJoCo computes the poses after the step, by an additional computation.
     After,
 }
 
@@ -48,9 +48,9 @@ pub(super) struct Task {
     pub(super) terminate_when_unhealthy: bool,
     pub(super) goal: Goal,
     pub(super) reset: Reset,
-    /// The range of each control, one for each action.
+    /// The range (low, high) of each control. An action has one entry for each control.
     pub(super) controls: Vec<(f64, f64)>,
-    /// Whether actions are scaled: ±1 are the ends of the control's range.
+    /// Whether actions are scaled, so that -1 and 1 stand for the ends of the control's range.
     pub(super) scaled: bool,
     pub(super) parameters: Vec<EditedParameter>,
     pub(super) applied: Vec<AppliedQuantity>,
@@ -116,8 +116,8 @@ pub(super) struct FolderEnvironment {
     push: Option<[f64; 3]>,
     /// Whether the physics have diverged since the last reset.
     diverged: bool,
-    /// Whether the model could not be compiled with the lengths that the last parameters give. Then all parameters have
-    /// their defaults, whatever they were before, and each episode ends as diverged in its first step.
+    /// Whether the model could not be compiled with the lengths that the last parameters give. Then the physics use the
+    /// defaults of all parameters, and each episode ends as diverged in its first step.
     is_impossible: bool,
 }
 
@@ -167,8 +167,8 @@ impl FolderEnvironment {
         let task = self.task;
         let started = shared::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // The simulation may still have the external forces of another environment, which no reading may see.
-            // `forward` computes them again if a sensor needs them.
+            // The shared simulation may still have the external forces of another environment. They are cleared, so
+            // that no reading contains them. `forward` computes external forces again if a sensor needs them.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);
@@ -343,7 +343,7 @@ impl Environment for FolderEnvironment {
         &self.task.hash
     }
 
-    /// Writes the action that makes each control the number in its range nearest to 0.
+    /// Writes the action that sets each control to the number in its range that is nearest to 0.
     fn neutral_action(&self, out: &mut [f32]) {
         for (entry, &(low, high)) in out.iter_mut().zip(&self.task.controls) {
             let control = 0.0_f64.clamp(low, high);
@@ -361,7 +361,8 @@ impl Environment for FolderEnvironment {
         let reset = &self.task.reset;
         let (qpos, qvel) = self.positions_mut();
         reset.draw(stream, qpos, qvel);
-        // Edited lengths may move bodies with free joints, so their initial positions are moved, too.
+        // Edited lengths may change the initial positions of bodies with free joints. The drawn positions are shifted
+        // by the same differences.
         let (own, compiled) = (Arc::clone(&self.task.template.model), Arc::clone(&self.edit.compiled));
         if !Arc::ptr_eq(&own, &compiled) {
             let initial = own.field(Field::InitialPositions).iter().zip(compiled.field(Field::InitialPositions));

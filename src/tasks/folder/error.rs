@@ -6,8 +6,8 @@ use std::{fmt, path::Path};
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{place}{problem}")]
 pub struct Error {
-    /// The file and the line, such as `task.toml, line 12: `. Without a line if the whole file is wrong; empty if the
-    /// folder itself is wrong.
+    /// The file and the line, such as `task.toml, line 12: `. There is no line if the whole file is wrong. The text is
+    /// empty if the folder itself is wrong.
     place: String,
     /// The mistake, what is expected, and what to do.
     problem: String,

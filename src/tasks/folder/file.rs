@@ -92,8 +92,8 @@ pub(super) fn read(files: &mut Files) -> Result<Task> {
     assemble(&top, about, (mjcf, model, main), files.hash())
 }
 
-/// Whether a parameter may edit a length, for which the model is compiled again. Errors in the tables are ignored here,
-/// since they are reported later.
+/// Whether any parameter may edit a length. Such edits require that the model is compiled again. Errors in the tables
+/// are ignored here, since they are reported later.
 fn edits_lengths(top: &Table<'_>) -> bool {
     let parameters = top.tables("parameter").unwrap_or_default();
     let mut edits = parameters.iter().flat_map(|table| table.tables("edit").unwrap_or_default());
@@ -189,7 +189,7 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
 
 /// Builds the task from the parsed file and the compiled model. `hash` is the hash of the folder's files.
 fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &str), hash: String) -> Result<Task> {
-    // The parts that only read the model.
+    // The parts of the task that read the model, but do not edit it.
     let elements = Elements::new(&model);
     let observation = top.require("observation", "[{ joint = \"*\", get = \"position\" }]")?.tables()?;
     let observation =
@@ -391,8 +391,8 @@ fn action_channels(model: &Model, elements: &Elements, controls: &[(f64, f64)], 
     leaked_list(names.iter().zip(controls).map(channel))
 }
 
-/// Returns the entries of an exact state: positions, then velocities. Their bounds are far beyond the values of any
-/// episode; they exclude absurd numbers.
+/// Returns the entries of an exact state: positions, then velocities. The bounds of the entries are far beyond the
+/// values of any episode, and exclude only absurd numbers.
 fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
     let mut channels = Vec::new();
     for is_velocity in [false, true] {
@@ -427,7 +427,7 @@ fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
 /// Estimates the computing time of a step in µs from the size of the model, see [`EnvironmentSpec::step_cost`].
 fn step_cost(model: &Model, frame_skip: u32) -> f64 {
     let (dofs, geoms) = (model.n_v() as f64, model.n_geom() as f64);
-    // RK4 computes the dynamics four times.
+    // The integrator RK4 computes the dynamics four times in each timestep.
     let stages = if model.options().integrator == 1 { 4.0 } else { 1.0 };
     f64::from(frame_skip) * stages * (2.0 + 0.35 * dofs + 0.02 * dofs * dofs + 0.3 * geoms)
 }

@@ -1,5 +1,5 @@
-//! Reads the files of a task's folder: each once, within limits of size, and never outside of the folder. The hash of
-//! the task covers all of them.
+//! Reads the files of a task's folder. Each file is read once, within limits of size, and no file outside of the folder
+//! is read. The hash of the task covers all of them.
 
 use super::error::{Error, Result, escaped};
 use sha2::{Digest, Sha256};
@@ -62,7 +62,7 @@ impl Files {
     }
 
     /// Returns the content of the file at a path within the folder, and reads it if it was not read before. `who` is
-    /// the file that refers to it, for error messages, for instance `robot.xml`.
+    /// the name of the file that refers to this file, for instance `robot.xml`; error messages contain it.
     ///
     /// # Errors
     /// [`Error`] if the path leaves the folder, if the file cannot be read, or if a limit is exceeded.
@@ -126,7 +126,7 @@ impl Files {
         hexadecimal(&all.finalize())
     }
 
-    /// Whether all files on the disk still have the contents that were read. Reads them again.
+    /// Reads all files again. Returns whether they still have the contents that were read before.
     pub(super) fn are_unchanged(&self) -> bool {
         self.read.iter().all(|(name, file)| self.is_unchanged(name, file))
     }

@@ -17,8 +17,8 @@ use perturb_mujoco::{Field, Index, Model};
 use roxmltree::Node;
 use std::collections::BTreeMap;
 
-/// A length, size, radius or position of the model that follows a parameter. The model must be compiled again to change
-/// it.
+/// A length, size, radius or position of the model that a parameter edits. After such an edit the model must be
+/// compiled again.
 #[derive(Debug)]
 pub(super) struct Slot {
     /// The index of the parameter.
@@ -60,8 +60,8 @@ impl Slot {
     }
 }
 
-/// A summand of a number in the text. It is `coefficient` if `slot` is `None`. Otherwise it is `coefficient` times the
-/// slot's amount, or times the square of the amount if `squared`.
+/// A summand of a number in the text. If `slot` is `None`, the summand is `coefficient`. Otherwise the summand is
+/// `coefficient` times the slot's amount, and the amount is squared if `squared`.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
@@ -75,8 +75,8 @@ impl Summand {
     }
 }
 
-/// A number in the text: the sum of its parts. If no slot in the parts changes anything, it is exactly `own`, without
-/// rounding errors of the sum.
+/// A number in the text: the sum of its parts. If the amounts of all slots in the parts are neutral, the number is
+/// exactly `own`, without rounding errors of the sum.
 #[derive(Debug)]
 struct EditedNumber {
     own: f64,
@@ -104,7 +104,8 @@ type Attribute = (&'static str, Vec<EditedNumber>);
 #[derive(Debug)]
 enum Piece {
     Text(String),
-    /// An edited element: its start with the unedited attributes, the edited attributes, and its end.
+    /// An edited element: the text of its start with the unedited attributes, the edited attributes, and the text of
+    /// its end.
     Element(String, Vec<Attribute>, &'static str),
 }
 
@@ -155,7 +156,7 @@ impl EditedText {
         Ok(Self { pieces })
     }
 
-    /// Returns the text with these amounts of the slots.
+    /// Returns the text with the numbers that follow from `amounts`, the amount of each slot.
     pub(super) fn write(&self, slots: &[Slot], amounts: &[f64]) -> String {
         let mut text = String::new();
         for piece in &self.pieces {
@@ -175,7 +176,7 @@ impl EditedText {
     }
 }
 
-/// The [`Slot`]s that scale a body, by their indices.
+/// The [`Slot`] that scales a body, by its index.
 #[derive(Clone, Copy, Default)]
 struct Scaling {
     /// The index of the [`Slot`] that scales positions and lengths.
@@ -224,7 +225,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Finds the slot that scales a body. Returns an error if a second slot scales it.
+    /// Finds the slot that scales a body. Returns an error if two slots scale the body.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
         for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {
@@ -241,7 +242,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(scaling)
     }
 
-    /// Refuses equality constraints that name a scaled body, because their anchors would not follow.
+    /// Refuses equality constraints that name a scaled body, because the constraints' anchors would not be scaled with
+    /// the body.
     fn constraints(&self, bodies: &[Node<'a, 'input>], scalings: &[Scaling]) -> Result<()> {
         for constraint in self.attributes.elements("connect").chain(self.attributes.elements("weld")) {
             for name in ["body1", "body2"].into_iter().filter_map(|key| constraint.attribute(key)) {
@@ -292,7 +294,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Edits the elements inside a body. `rank` is the number of the body's geoms so far, and is updated.
+    /// Edits the elements inside a body. `rank` counts the geoms of the body that were visited so far, and is updated.
     fn content(&mut self, node: Node<'a, 'input>, body: usize, scaling: Scaling, rank: &mut usize) -> Result<()> {
         let inertial = self.attributes.inertial(node);
         for child in node.children().filter(Node::is_element) {
@@ -314,7 +316,7 @@ impl<'a, 'input> Editor<'a, 'input> {
                 _ => {}
             }
         }
-        // An explicit inertia grows with the square of the size, at constant mass.
+        // At constant mass, the inertia that an `<inertial>` element states grows with the square of the size.
         let (Some(inertial), Some(slot)) = (inertial, scaling.along) else { return Ok(()) };
         if scaling.size.is_none() {
             let problem =
@@ -350,7 +352,7 @@ impl<'a, 'input> Editor<'a, 'input> {
             return Err((self.refuse)(slot, "another edit sets the radius of one of its geoms, too; edit one of both"));
         }
         let Some(slot) = along.or(radius) else { return Ok(()) };
-        // An edit must have an effect on contacts or on the inertia.
+        // An edit that affects neither contacts nor the inertia is refused.
         let kind = self.attributes.get(node, "type").unwrap_or("sphere");
         let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
         if none && !touches {
@@ -381,7 +383,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         }
     }
 
-    /// Scales the first numbers of an attribute by the slots in `first`, one each, and the remaining numbers by `rest`.
+    /// Scales the numbers of an attribute: the first numbers by one slot of `first` each, the remaining numbers by the
+    /// slot `rest`.
     fn scale(
         &mut self,
         node: Node<'a, 'input>,
@@ -399,7 +402,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Returns the numbers of an attribute of an element or of its default class; `absent` if neither has it.
+    /// Returns the numbers of an attribute of an element or of its default class. Returns `absent` if neither has the
+    /// attribute.
     fn numbers(&self, node: Node<'a, 'input>, key: &str, absent: &[f64]) -> Result<Vec<f64>> {
         let Some(text) = self.attributes.get(node, key) else { return Ok(absent.to_vec()) };
         let numbers = text.split_whitespace().map(|number| number.parse().ok()).collect::<Option<Vec<f64>>>();
@@ -422,7 +426,8 @@ impl<'a, 'input> Editor<'a, 'input> {
 }
 
 /// Returns the vector from the origin of a body's frame to the point at which it is attached, in the axes of its
-/// parent. This point is the anchor of its first hinge or ball joint, or the origin itself if it has none.
+/// parent. This point is the anchor of the body's first hinge or ball joint, or the origin itself if the body has no
+/// such joint.
 pub(super) fn attachment(model: &Model, body: usize) -> [f64; 3] {
     let (types, bodies) = (model.index_array(Index::JointType), model.index_array(Index::JointBody));
     let is_own = |&joint: &usize| bodies[joint] as usize == body && matches!(types[joint], 1 | 3);

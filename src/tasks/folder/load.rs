@@ -38,7 +38,7 @@ impl fmt::Debug for Folder {
     }
 }
 
-/// Loads a folder. It stays in memory until the process ends, because sessions refer to it.
+/// Loads a folder. The folder stays in memory until the process ends, because sessions refer to it.
 ///
 /// MuJoCo may abort the process or use all its memory for a bad model. Call [`check`](super::child::check) first for a
 /// folder that is new.

@@ -132,8 +132,8 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     Ok(Mjcf { physics, picture, statistic, has_total_mass, leaves_out: false })
 }
 
-/// Reads a model file and all files that it includes, and appends their names and texts to `sources`. `who` is the file
-/// that refers to it, for error messages.
+/// Reads a model file and all files that it includes, and appends their names and texts to `sources`. `who` is the name
+/// of the file that refers to this file, for error messages.
 fn collect(files: &mut Files, path: &str, who: &str, sources: &mut Vec<(String, String)>) -> Result<()> {
     let text = decode(path, files.read(path, who)?)?.to_owned();
     let included: Vec<String> = {
@@ -219,7 +219,8 @@ fn line_ends(text: &str) -> Vec<usize> {
     text.bytes().enumerate().filter(|&(_, byte)| byte == b'\n').map(|(offset, _)| offset).collect()
 }
 
-/// The subfolders in which MuJoCo looks for files. As in MuJoCo, the last `<compiler>` that sets a subfolder counts.
+/// The subfolders in which MuJoCo looks for files. If several `<compiler>` elements set the same subfolder, the last
+/// one counts, as in MuJoCo.
 #[derive(Default)]
 struct Folders {
     mesh: String,
@@ -305,8 +306,8 @@ impl Writer<'_> {
             }
             write_attribute(&mut picture, key, &picture_value);
         }
-        // MuJoCo gives an element without a name the name of its file. Files are renamed here, so the original name is
-        // added.
+        // MuJoCo names an element without a name after its file. The text refers to files by new names, so the
+        // element's original name is added.
         if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some())
             && !node.has_attribute("name")
             && !in_defaults(&node)
@@ -347,7 +348,7 @@ impl Writer<'_> {
     }
 
     /// Reads a file to which an element refers. Returns its name in the text for the physics and in the text for
-    /// pictures. Files that only pictures need are read, too, because they enter the hash of the task.
+    /// pictures. Files that only pictures need are read, too, because the hash of the task covers them.
     fn file(&mut self, part: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
         let source = &self.parts[part];
         let path = self.folders.path(node.tag_name().name(), value);

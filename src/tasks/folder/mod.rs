@@ -44,5 +44,5 @@ pub use error::{Error, LoadError};
 pub use load::{Folder, load, read_model};
 pub use report::report;
 
-/// The JSON schema of `task.toml`.
+/// The JSON schema of `task.toml`, as text.
 pub const SCHEMA: &str = include_str!("schema.json");

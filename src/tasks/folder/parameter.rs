@@ -1,5 +1,5 @@
-//! The parameters of a task: the numbers of the model that each edits, its bounds, and the values that each version
-//! draws.
+//! The parameters of a task. Each parameter has the numbers of the model that it edits, its bounds, and the values that
+//! each version draws.
 
 use super::{
     elements::Elements,
@@ -16,7 +16,7 @@ const PARAMETER: &[&str] = &["name", "unit", "description", "edit", "default", "
 const EDIT: [&str; 2] = ["by", "factor"];
 const APPLIED: [&str; 2] = ["name", "unit"];
 
-/// An edit: numbers of the model that follow a parameter's value in the same way.
+/// An edit: the numbers of the model that a parameter changes in the same way.
 #[derive(Debug, Clone)]
 pub(super) struct Edit {
     pub(super) targets: Targets,
@@ -95,8 +95,8 @@ impl EditedParameter {
         self.edits.iter().flat_map(|edit| edit.targets.all.iter().copied())
     }
 
-    /// Applies a value to a simulation whose model is `pristine`. Lengths are skipped, since `pristine` was compiled
-    /// with them.
+    /// Applies a value to a simulation whose model is `pristine`. Lengths are skipped, since `pristine` was already
+    /// compiled with the edited lengths.
     pub(super) fn apply(&self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         for edit in &self.edits {
             for &target in edit.targets.all.iter().filter(|target| !target.is_recompiled()) {
@@ -118,9 +118,9 @@ impl EditedParameter {
         })
     }
 
-    /// Reads the parameter's value back from the edited `model`. If its targets have different values, returns the one
-    /// that differs most from `requested`. `own` is the folder's model without edits, `compiled` the model with edited
-    /// lengths but without other edits.
+    /// Reads the parameter's value back from the edited `model`. If its targets have different values, returns the
+    /// value that differs most from `requested`. `own` is the folder's model without edits, `compiled` the model with
+    /// edited lengths but without other edits.
     pub(super) fn read_back(&self, (own, compiled): (&Model, &Model), model: &Model, requested: f64) -> f64 {
         let values = self.edits.iter().flat_map(|edit| {
             edit.targets.all.iter().map(|target| {
@@ -218,8 +218,8 @@ fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
     }
 }
 
-/// Reads the interval of version R and the two intervals of version E. Those of E must adjoin that of R, below and
-/// above.
+/// Reads the interval of version R and the two intervals of version E. The intervals of E must adjoin the interval of
+/// R, one below and one above.
 pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
     let within = |value: &Value<'_>, name: &str, (low, high): (f64, f64)| {
         if bounds.0 <= low && high <= bounds.1 {

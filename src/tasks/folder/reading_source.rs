@@ -8,7 +8,8 @@ use super::{
 };
 use perturb_mujoco::{Field, Flags, Index, Kind, Model, Reading as Array};
 
-/// The values of the key `get` for a joint. The constants below are those for other kinds of elements.
+/// The allowed values of the key `get` for a joint. The constants below list the allowed values for other kinds of
+/// elements.
 const OF_A_JOINT: &[&str] = &["position", "velocity", "sin", "cos", "scaled", "actuation", "constraint"];
 const OF_A_BODY: &[&str] = &[
     "position",
@@ -85,7 +86,7 @@ impl Source<'_> {
         })
     }
 
-    /// Refuses the key `get`, for subjects that have only one quantity.
+    /// Refuses the key `get`. Call this method for subjects that have only one quantity.
     fn no_get(&self, subject: &str) -> Result<()> {
         match self.table.get("get") {
             None => Ok(()),
@@ -116,8 +117,8 @@ impl Source<'_> {
                 BALL => &FREE_VELOCITY[3..],
                 _ => &[""],
             };
-            // A free or ball joint has several positions and velocities, which have names. Other joints have one of
-            // each.
+            // A free or ball joint has several positions and velocities, which have names. Other joints have one
+            // position and one velocity.
             let (parts, first) = if get == "position" { (positions, position) } else { (velocities, velocity) };
             if matches!(get, "sin" | "cos" | "scaled") && parts.len() > 1 {
                 let problem =

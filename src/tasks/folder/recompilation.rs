@@ -13,7 +13,8 @@ use std::{
     sync::{Arc, Mutex, PoisonError},
 };
 
-/// Maximal size of a model whose lengths are edited, in bytes. Each environment may need a model of its own.
+/// Maximal size of a model whose lengths are edited, in bytes. The limit is low, because each environment may need its
+/// own compiled model.
 const MAX_MODEL_BYTES: usize = 1 << 20;
 /// Maximal total size of the cached models of a task, in bytes.
 const MAX_CACHE_BYTES: usize = 8 << 20;
@@ -32,7 +33,7 @@ pub(super) struct Recompilation {
 
 #[derive(Debug, Default)]
 struct CompiledModels {
-    /// The compiled models. A key has the bits of [`Slot::amount`] for each slot.
+    /// The compiled models. The key has the bits of [`Slot::amount`] for each slot.
     models: HashMap<Box<[u64]>, Arc<Model>>,
     /// The keys of `models`, oldest first.
     order: VecDeque<Box<[u64]>>,
@@ -107,7 +108,7 @@ impl Recompilation {
     }
 
     /// Returns the model with the lengths that the parameters `values` give, from the cache if possible. If no length
-    /// differs, returns `own`, the folder's model without edits.
+    /// differs from the unedited model, returns `own`, the unedited model.
     ///
     /// # Errors
     /// [`Error::Compile`] if the model cannot be compiled with these lengths.
@@ -135,7 +136,8 @@ impl Recompilation {
         Ok(model)
     }
 
-    /// Returns the MJCF for pictures with the lengths that the parameters `values` give; `None` if no length differs.
+    /// Returns the MJCF for pictures with the lengths that the parameters `values` give; `None` if no length differs
+    /// from the unedited model.
     pub(super) fn picture(&self, values: &[f64]) -> Option<String> {
         let amounts = self.amounts(values);
         (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.slots, &amounts))

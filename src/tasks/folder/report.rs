@@ -13,7 +13,7 @@ use perturb_mujoco::Kind;
 use std::{fmt::Write, path::Path, time::Duration};
 use tokio::time::Instant;
 
-/// Duration of the measurement of the speed.
+/// Duration of the measurement of an environment's speed.
 const TIMED: Duration = Duration::from_millis(200);
 /// Number of compilations whose median time is reported.
 const N_COMPILATIONS: u32 = 9;

@@ -17,7 +17,8 @@ const RESET: &[&str] = &["keyframe", "position", "velocity", "joints"];
 const NOISE: &[&str] = &["uniform", "normal"];
 const JOINTS: &[&str] = &["joint", "position", "velocity"];
 const PLACEMENT: &[&str] = &["uniform", "normal", "disc", "box", "beyond"];
-/// Maximal number of draws of a point in a box until one is far enough from 0. If none is, the last draw is used.
+/// Maximal number of attempts to draw a point in a box that is far enough from 0. After the last attempt, its point is
+/// used anyway.
 const MAX_DRAWS: usize = 1000;
 
 /// Noise that is added to a number.
@@ -289,7 +290,8 @@ fn normal_quantile(p: f64) -> f64 {
         let polynomial = |factors: [f64; 8]| factors.into_iter().reduce(|sum, factor| sum * x + factor).unwrap_or(0.0);
         polynomial(above) / polynomial(below)
     };
-    // Near 1/2 the quantile is a function of q, otherwise of the logarithm of the tail's probability.
+    // If `p` is near 1/2, the quantile is computed from q = p - 1/2, otherwise from the logarithm of the tail's
+    // probability.
     let p = p.max(1.0 / (1u64 << 54) as f64);
     let q = p - 0.5;
     if q.abs() <= 0.425 {
@@ -307,7 +309,7 @@ mod tests {
 
     #[test]
     fn normal_quantiles_are_those_of_python() {
-        // statistics.NormalDist().inv_cdf of Python 3.11.
+        // The quantiles `x` come from `statistics.NormalDist().inv_cdf` of Python 3.11.
         for (p, x) in [
             (0.5, 0.0),
             (0.1, -1.2815515655446008),

@@ -29,12 +29,12 @@ pub(super) const OPTIONS: [&str; 12] = [
     "sigma",
     "otherwise",
 ];
-/// Maximal absolute value of a term. An action may have any f32 value, and the reward, which may contain its square,
-/// must still be finite.
+/// Maximal absolute value of a term. An action may have any f32 value, and the reward may contain the action's square,
+/// but must still be finite.
 const MAX_TERM: f64 = 1e30;
 /// The natural logarithm of 0.1.
 const LN_0_1: f64 = -std::f64::consts::LN_10;
-/// Absolute scaled position above which a joint counts as at its limit. Its range is scaled to ±1.
+/// Absolute scaled position above which a joint counts as at its limit. The joint's range is scaled to ±1.
 const AT_LIMIT: f64 = 0.99;
 
 /// A term of the reward.
@@ -77,12 +77,13 @@ enum TermKind {
     Constant,
 }
 
-/// How [`TermKind::Within`] decreases with the distance from the range.
+/// The function by which [`TermKind::Within`] decreases with the distance from the range.
 #[derive(Debug, Clone, Copy)]
 enum MarginShape {
-    /// Linearly from 1 at the range to 0 at the margin and beyond.
+    /// It decreases linearly from 1 at the range to 0 at the margin, and stays 0 beyond.
     Linear,
-    /// As exp(ln(0.1) × (distance / margin)²), like dm_control's `tolerance`. This is 0.1 at the margin.
+    /// It decreases as exp(ln(0.1) × (distance / margin)²), like dm_control's `tolerance`. The value is 0.1 at the
+    /// margin.
     Gaussian,
 }
 
@@ -345,8 +346,8 @@ fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
     }
 }
 
-/// Reads the actuators of a table such as `{ actuator = "*" }`. Each must drive a hinge or slide. Returns their
-/// indices, and the indices of their joints in `qvel`.
+/// Reads the actuators of a table such as `{ actuator = "*" }`. Each must drive a hinge or slide. Returns for each
+/// actuator its index, and the index of its joint in `qvel`.
 fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["actuator"])?;
@@ -363,7 +364,7 @@ fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(u
 }
 
 /// Reads the joints of a table such as `{ joint = "*" }`. Skips joints other than hinges and slides with a range.
-/// Returns their indices, and their indices in `qpos`.
+/// Returns for each joint its index in the model, and its index in `qpos`.
 fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["joint"])?;

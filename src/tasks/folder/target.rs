@@ -33,7 +33,7 @@ const N_GEAR: usize = 6;
 pub(super) enum Target {
     /// A single number: (array, index).
     Number(Field, usize),
-    /// Two consecutive numbers that are always equal: (array, index of the first).
+    /// Two consecutive numbers that get the same value: (array, index of the first).
     Twins(Field, usize),
     /// Both ends of a range that is symmetric about 0: (array, index of the lower end). The value is the upper end.
     Symmetric(Field, usize),
@@ -43,9 +43,9 @@ pub(super) enum Target {
     Mass(usize),
     /// The first number of an actuator's gear. The other numbers change in proportion.
     Gear(usize),
-    /// The gain `kp` of a position servo. Its bias changes with it.
+    /// The gain `kp` of a position servo. The servo's bias changes with the gain.
     PositionGain(usize),
-    /// The gain `kv` of a velocity servo. Its bias changes with it.
+    /// The gain `kv` of a velocity servo. The servo's bias changes with the gain.
     VelocityGain(usize),
     /// The damping `kv` of an actuator with an affine bias.
     ActuatorDamping(usize),
@@ -59,7 +59,8 @@ pub(super) enum Target {
     Position(usize, usize),
 }
 
-/// The targets of an edit. They are the same field of one or more elements of the same kind, or an option of the model.
+/// The targets of an edit: a field, such as the mass, of one or more elements of the same kind, or an option of the
+/// model.
 #[derive(Debug, Clone)]
 pub(super) struct Targets {
     pub(super) all: Vec<Target>,
@@ -73,7 +74,7 @@ pub(super) struct Targets {
     pub(super) names: Vec<String>,
 }
 
-/// How a parameter's value changes a target: replaces it, multiplies it, or is added to it.
+/// The way in which a parameter's value changes a target: it replaces, multiplies, or is added to the target's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Change {
     Set,
@@ -196,8 +197,8 @@ impl Targets {
         Ok(Self { all, subject: "option", field: option, ids: Vec::new(), names: vec![option.to_owned()] })
     }
 
-    /// Returns the minimum of physical values of the targets, and whether the minimum itself is excluded. `None` if
-    /// there is no minimum. Masses must be positive, and most other values must not be negative.
+    /// Returns the minimum of the physically possible values of the targets, and whether the minimum itself is
+    /// excluded. `None` if there is no minimum. Masses must be positive, and most other values must not be negative.
     pub(super) fn least(&self) -> Option<(f64, bool)> {
         match (self.subject, self.field) {
             ("body", "position") => None,
@@ -360,7 +361,7 @@ impl Target {
         }
     }
 
-    /// Sets the value in the model of a simulation, which still has the unedited value of `pristine`.
+    /// Sets the value in the model of a simulation. Before, the model must have the unedited value of `pristine`.
     pub(super) fn set(self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         let (field, at) = self.place();
         let own = self.value(pristine);
@@ -414,7 +415,7 @@ impl Target {
         let (field, at) = self.place();
         let own = pristine.field(field)[at];
         match self {
-            // The upper end may be 0.
+            // The upper end of a range may be 0. The factor is computed from the lower end then.
             Self::Ends(..) if own == 0.0 => model.field(field)[at - 1] / pristine.field(field)[at - 1],
             _ => model.field(field)[at] / own,
         }

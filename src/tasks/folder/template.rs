@@ -47,7 +47,7 @@ impl Template {
         Ok(Self { model, state, fields: Vec::new(), recompilation: None, derives: false, statistic })
     }
 
-    /// Prepares the template for edits by these parameters. Call it once, before the first edit.
+    /// Prepares the template for edits by these parameters. Call this method once, before the first edit.
     pub(super) fn prepare(&mut self, parameters: &[EditedParameter], recompilation: Option<Recompilation>) {
         self.recompilation = recompilation;
         let edited = || parameters.iter().flat_map(EditedParameter::targets);

@@ -18,8 +18,8 @@ pub struct Names {
     pub observation: &'static [Channel],
     /// The entries of an action.
     pub action: &'static [Channel],
-    /// The entries of an exact state. Their bounds are far beyond the values of any episode; they exclude numbers that
-    /// would overflow.
+    /// The entries of an exact state. The bounds of the entries are far beyond the values of any episode, and exclude
+    /// only numbers that would overflow.
     pub state: &'static [Channel],
 }
 

@@ -24,10 +24,11 @@ use std::sync::OnceLock;
 /// drawn only up to 40 m from the start, and a line that marks the goal.
 pub(super) const SCENERY: &str = include_str!("../../../models/scenery.xml");
 
-/// The description of a robot: its specification, model, names of joints and geoms, and the rule whether it is alive.
+/// The description of a robot: its specification, model, names of joints and geoms, and the rule that decides whether
+/// it is alive.
 pub(super) struct Robot {
     pub spec: &'static EnvironmentSpec,
-    /// The model and how pictures show it.
+    /// The model, and the camera and scenery of its pictures.
     pub look: Look,
     pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,

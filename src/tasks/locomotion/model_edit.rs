@@ -27,8 +27,9 @@ pub struct RobotEdit {
 }
 
 impl RobotEdit {
-    /// Applies the parameters to the model of `simulation`, and returns them as an edit. `compiled_constants` are the
-    /// constants of the compiled model. The state of the simulation is undefined afterwards.
+    /// Applies the parameters to the model of `simulation`. Returns the edit: the parameters and the edited constants.
+    /// `compiled_constants` are the constants of the compiled model. The state of the simulation is undefined
+    /// afterwards.
     ///
     /// # Errors
     /// MuJoCo's fatal errors.
@@ -51,7 +52,7 @@ impl RobotEdit {
                 coefficients[0] = friction;
             }
         }
-        // Many arrays follow from masses: subtree masses, inverse weights, the scale of the solver.
+        // Computes the arrays that follow from masses: subtree masses, inverse weights, the scale of the solver.
         simulation.set_const()?;
         let mut constants: Box<[f64]> = compiled_constants.into();
         simulation.constants(&mut constants);
@@ -78,13 +79,13 @@ impl EditedElements {
         model.body_mass()[self.torso_body]
     }
 
-    /// Returns the torso's density in a model, in kg/m³. It is computed from the torso's masses in this and in the
-    /// compiled model, `pristine`.
+    /// Returns the torso's density in a model, in kg/m³. It is computed from the torso's mass in `model` and its mass
+    /// in `pristine`, the compiled model.
     pub(super) fn density(self, model: &Model, pristine: &Model) -> f64 {
         self.torso_mass(model) / (self.torso_mass(pristine) / COMPILED_DENSITY)
     }
 
-    /// Returns the robot's sliding friction in a model, which is equal for all its geoms.
+    /// Returns the robot's sliding friction in a model. All geoms of the robot have the same friction.
     pub(super) fn friction(self, model: &Model) -> f64 {
         model.geom_friction()[3 * self.torso_geom]
     }

@@ -17,7 +17,7 @@ pub(super) const MAX_JOINTS: usize = 6;
 /// Maximal length of a robot's [state](Simulation::state).
 pub(super) const MAX_STATE: usize = 1 + 3 * (N_ROOT + MAX_JOINTS) + MAX_JOINTS;
 
-/// A robot's compiled model, which is never modified, and facts about it.
+/// A robot's compiled model, which is never modified, and values that are computed from the model once.
 pub struct Pristine {
     pub(super) model: Model,
     pub(super) constants: Vec<f64>,

@@ -20,8 +20,8 @@ const ELECTRICITY_COST: f64 = 2.0;
 const STALL_TORQUE_COST: f64 = 0.1;
 const JOINT_LIMIT_COST: f64 = 0.2;
 const AT_LIMIT: f64 = 0.99;
-/// Maximal value of each cost. An action may have any f32 value, and the reward, which contains its square, must still
-/// be finite as f32.
+/// Maximal value of each cost. An action may have any f32 value, and the reward contains the action's square, but must
+/// still be finite as f32.
 const MAX_COST: f64 = 1e30;
 
 /// Number of entries about the torso, at the start of an observation.
@@ -32,8 +32,8 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 /// A robot in a vertical plane that is rewarded for running along +x.
 ///
 /// A step sets the controls to `power` × the action clipped to ±1, and simulates four timesteps of 4.125 ms. The
-/// observation has the contact flags of the previous step. These also decide whether the robot is alive. The reward is
-/// the sum of
+/// observation has the contact flags of the previous step. These flags also decide whether the robot is alive. The
+/// reward is the sum of
 ///
 /// | term | value |
 /// |---|---|
@@ -60,7 +60,7 @@ pub struct Walker {
     /// The state in the layout of [`Simulation::state`]. It is undefined after the physics diverged.
     state: [f64; MAX_STATE],
     /// The contact flags that the next step observes, in the order of [`Names::contacts`](super::Names::contacts).
-    /// `None` if they are to be computed from the state. At the start of an episode all are false.
+    /// `None` if the flags must be computed from the state. At the start of an episode all flags are false.
     contacts: Option<[bool; MAX_JOINTS]>,
     observation: [f32; MAX_OBSERVATION],
     /// The torso's height at the reset, in m.
@@ -167,8 +167,8 @@ impl Walker {
             *ctrl = self.power * f64::from(a).clamp(-1.0, 1.0);
         }
         simulation.step_without_search()?;
-        // A timestep first computes the contacts of the state before it. So after the first timestep, the simulation
-        // has the contacts at the end of the previous step.
+        // A timestep first computes the contacts of the state before it. So after the first timestep of a step, the
+        // simulation has the contacts of the state at the end of the previous step.
         let contacts = self.contacts.unwrap_or_else(|| self.pristine.touching(simulation));
         for _ in 1..N_SUBSTEPS {
             simulation.step_without_search()?;
@@ -267,8 +267,8 @@ impl Walker {
     }
 }
 
-/// The message of an `expect`, which states why it cannot fail. If it fails anyway, the worker's panic ends its batch,
-/// but not the server.
+/// The message of an `expect` that cannot fail; the message states why. If the `expect` fails anyway, the worker's
+/// panic ends its batch, but not the server.
 const NO_MEMORY: &str = "there is memory for the one simulation of this thread";
 
 impl Environment for Walker {
@@ -282,7 +282,7 @@ impl Environment for Walker {
         };
         self.power = power;
         let edit = || self.pristine.edit(density, friction);
-        // A fatal error needs a second attempt, with a new simulation.
+        // After a fatal error of MuJoCo, the edit is tried a second time, with a new simulation.
         self.edit = edit().or_else(|_| edit()).expect(NO_MEMORY);
     }
 
@@ -367,14 +367,15 @@ impl Environment for Walker {
         }
         let contacts = self.contacts();
         out.extend(contacts[..self.robot.names.contacts.len()].iter().map(|&flag| f64::from(u8::from(flag))));
-        // The observation is saved because its contact flags, of the previous step, cannot be computed from the state.
+        // The observation is saved, because it has the contact flags of the previous step, which cannot be computed
+        // from the state.
         out.extend(self.observation[..self.robot.spec.observation.len()].iter().map(|&value| f64::from(value)));
         out.push(self.greatest_x);
     }
 
     fn load(&mut self, state: &[f64]) -> Result<(), Error> {
         let refuse = |reason: String| Err(Error::Snapshot { reason });
-        // Older snapshots end with the observation.
+        // Snapshots of older servers end with the observation, and lack the maximum of x.
         let has_greatest_x = state.len() == self.n_saved();
         if !has_greatest_x && state.len() + 1 != self.n_saved() {
             return refuse(format!("its state has {} numbers, expected {}", state.len(), self.n_saved()));

@@ -27,7 +27,7 @@ pub(super) fn drawing(angle: f64, length: f64, torque: Option<f64>) -> Drawing {
     drawing.polygon(&held, colour::PALE_GREEN);
     drawing.dashes(&[pivot, [0.0, length + ROD]], 0.02, colour::GREEN);
     drawing.rod(pivot, polar(pivot, length, FRAC_PI_2 + angle), ROD, colour::VERMILLION);
-    // A very small torque has no arrow, because the arrow's head has a fixed size.
+    // A very small torque gets no arrow, because the arrow's head has a fixed size and would be too large.
     let share = torque.map(|torque| torque / MAX_TORQUE);
     if let Some(share) = share.filter(|share| share.abs() > 0.01) {
         // The arrow is an arc below the pivot, in the direction of the torque. Its length shows the torque's size.

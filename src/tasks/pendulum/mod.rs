@@ -1,7 +1,7 @@
 //! Pendulum: swing a rod up with a weak torque and hold it there.
 //!
-//! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10 m/s². The speed is clipped before the angle is updated. Gym of 2018,
-//! which the paper used, clipped it afterwards.
+//! Source: Gymnasium 1.4 `Pendulum-v1`, g = 10 m/s². The speed is clipped before the angle is updated. The Gym of 2018,
+//! which the paper used, clipped the speed afterwards.
 
 mod drawing;
 
@@ -91,8 +91,8 @@ impl Pendulum {
         Self { length, mass, state: [0.0; 2], torque: None, push: 0.0 }
     }
 
-    /// Advances by one step with a torque in N m, which is clipped to ±2. Unlike an action, which is f32, the torque is
-    /// f64, as in the reference trajectories that tests compare with.
+    /// Advances by one step with a torque in N m, which is clipped to ±2. The torque is f64, although actions are f32,
+    /// because tests compare with reference trajectories of f64 torques.
     pub fn step_with_torque(&mut self, torque: f64, reward_terms: &mut [f64]) -> Transition {
         let [theta, velocity] = self.state;
         let (m, l) = (self.mass, self.length);
