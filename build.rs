@@ -1,4 +1,4 @@
-//! Build script that finds the commit. Every package that prints its commit uses it.
+//! Build script that finds the commit that is built. Every package whose program prints the commit uses this script.
 
 use std::error::Error;
 use std::path::Path;

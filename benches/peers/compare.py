@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 @contextmanager
 def started(peer: Peer, index: int, purejaxrl: Path) -> Iterator[subprocess.Popen[str]]:
-    """Start a peer as a process. It waits for seeds after it has imported and compiled."""
+    """Start a peer as a process. After its imports and compilation, it waits for a seed on its standard input."""
     command = [sys.executable, str(HERE / peer.script), str(index), str(purejaxrl)]
     environ = os.environ | peer.environ
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environ)
@@ -64,7 +64,7 @@ def compare(index: int, rounds: int, program: Path, purejaxrl: Path) -> None:
 
 
 def report(rates: dict[str, list[float]]) -> None:
-    """Print the medians, the ratios of perturb's median to the peers', and the range of the rounds' ratios."""
+    """Print the medians, the ratio of perturb's median to each peer's median, and the range of the rounds' ratios."""
     ours = rates["perturb"]
     for name, measured in rates.items():
         line = f"  {name}: median {statistics.median(measured):,.0f} steps/s"
@@ -76,7 +76,7 @@ def report(rates: dict[str, list[float]]) -> None:
 
 
 def main() -> None:
-    """Compare in every selected contest."""
+    """Measure and print every contest that the command line selects."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("contest", nargs="?", default="", help="a part of the contest's name")
     parser.add_argument("--rounds", type=int, default=5)

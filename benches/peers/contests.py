@@ -5,7 +5,8 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 
-# Settings with perturb's names and defaults, which each peer translates. Learning rates are constant.
+# Settings with perturb's names and defaults. The program of each peer translates them to the peer's names. Learning
+# rates are constant.
 PPO = {
     "learning_rate": 3e-4,
     "n_epochs": 10,
@@ -41,7 +42,7 @@ class Peer:
 
 
 PUREJAXRL = Peer("PureJaxRL", "with_purejaxrl.py")
-# XLA without its newer CPU runtime, which is JAX's default but slower with networks as small as these.
+# PureJaxRL with XLA's older CPU runtime. JAX uses the newer runtime by default, but it is slower for small networks.
 PUREJAXRL_WITHOUT_THUNKS = replace(
     PUREJAXRL,
     name="PureJaxRL, thunk runtime off",
@@ -61,8 +62,8 @@ class Contest:
     iterations: int
     peers: tuple[Peer, ...]
     # Minimum mean length of the last episodes, in steps, which shows that the training learned. CartPole's episodes
-    # last about 20 steps without learning. HalfCheetah's end early in perturb, where it can fall, and never in
-    # Gymnasium.
+    # last about 20 steps without learning. Episodes of HalfCheetah end early in perturb if the robot falls. In
+    # Gymnasium they never end early.
     min_length: float
 
     @property

@@ -51,7 +51,8 @@ def wait_for(process: subprocess.Popen[bytes], path: Path, steps: int) -> dict[s
     while time.monotonic() < deadline:
         if process.poll() is not None:
             raise RuntimeError("perturb ended before the contest did")
-        # Polling is too rare to slow the training down. The training measures its own time.
+        # Polls only ten times a second, so that the training is not slowed down. The result does not depend on this
+        # interval, because the training measures its own time.
         time.sleep(0.1)
         if not path.exists():
             continue

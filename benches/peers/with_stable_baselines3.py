@@ -10,7 +10,8 @@ import time
 from dataclasses import replace
 from typing import Any
 
-# Gymnax installs the old gym. stable-baselines3 would import it and print a warning about its age.
+# Gymnax installs the old package gym. This line prevents stable-baselines3 from importing gym, which would print a
+# warning about its age.
 sys.modules["gym"] = None  # type: ignore[assignment]
 
 import stable_baselines3  # noqa: E402
@@ -58,7 +59,7 @@ def train(contest: Contest, seed: int) -> Training:
 
 
 def fastest(contest: Contest) -> int:
-    """Return the faster number of PyTorch threads, one or the number of cores, by a short training with each."""
+    """Return the number of PyTorch threads, one or the number of cores, with which a short training is faster."""
     short = replace(contest, iterations=contest.iterations // 20)
     seconds = {}
     for threads in [1, len(os.sched_getaffinity(0))] * 2:

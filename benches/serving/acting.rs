@@ -17,7 +17,7 @@ const BATCH: usize = 8;
 /// The number of elements in CartPole's observation.
 const OBSERVATION: usize = 4;
 const ACTION: ActionKind = ActionKind::Discrete { n: 2 };
-/// The number of steps for each request; a sixteenth of it for a recurrent policy.
+/// The number of steps in a request for a feed-forward policy. A recurrent policy plays a sixteenth of them.
 const STEPS: u32 = 1024;
 
 /// Returns the id of the measurement.
@@ -73,7 +73,8 @@ fn local_player(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
     Ok(player)
 }
 
-/// Runs `steps` steps of the player alone, always with the same observation. Returns the elapsed time in seconds.
+/// Computes the player's actions for `steps` steps without environments, always with the same observation. Returns the
+/// elapsed time in seconds.
 fn compute(player: &mut Player, steps: u32) -> Result<f64, Failure> {
     let outcome = StepOutcome {
         observations: &[0.02; BATCH * OBSERVATION],

@@ -57,7 +57,7 @@ impl Client {
         Self::open_drawn(socket, spec, batch, &[]).await
     }
 
-    /// Opens any environment, given by its specification, and draws parameters from these distributions.
+    /// Opens any environment, given by its specification. Its parameters are drawn from these distributions.
     #[cfg(feature = "mujoco")]
     pub(crate) async fn open_drawn(
         socket: &Path,
@@ -88,7 +88,8 @@ impl Client {
         Ok(Self { spec, batch, session, noise: Noise(7) })
     }
 
-    /// Makes `trips` steps, each after the reply to the previous one. Returns the elapsed time in seconds.
+    /// Makes `trips` steps. Each step is requested after the reply to the previous step. Returns the elapsed time in
+    /// seconds.
     pub(crate) async fn run(&mut self, trips: usize) -> Result<f64, Failure> {
         let actions: Vec<Bytes> = (0..trips).map(|_| self.actions()).collect();
         let start = Instant::now();
@@ -96,8 +97,8 @@ impl Client {
         Ok(start.elapsed().as_secs_f64())
     }
 
-    /// Steps with these actions, with up to `in_flight` requests at a time that have no reply yet. Returns the last
-    /// observations.
+    /// Makes a step with each element of `actions`. Up to `in_flight` requests may wait for their replies at the same
+    /// time. Returns the observations after the last step.
     pub(crate) async fn play(&mut self, actions: &[Bytes], in_flight: usize) -> Result<Bytes, Failure> {
         let mut sent = 0;
         let mut last = Bytes::new();
@@ -114,7 +115,7 @@ impl Client {
         Ok(last)
     }
 
-    /// Makes the server act for `steps` steps. Returns the elapsed time in seconds.
+    /// Makes the server play `steps` steps with a policy. Returns the elapsed time in seconds.
     pub(crate) async fn act(&mut self, request: proto::Act, steps: u32) -> Result<f64, Failure> {
         let start = Instant::now();
         let acted = self.session.ask(request).await?;

@@ -1,6 +1,6 @@
 //! Compares this server with another executable of it, for example one of the previous commit: `cargo bench --bench
-//! serving -- compare PROGRAM`. Both serve the same steps in alternating short rounds, so that other load affects both.
-//! The output has medians over pairs of rounds. Both must give the same observations.
+//! serving -- compare PROGRAM`. Both programs serve the same steps in alternating short rounds, so that other load
+//! affects both. The output has medians over pairs of rounds. The observations from both programs must be equal.
 
 use crate::{
     Failure,
@@ -10,14 +10,14 @@ use crate::{
 use bytes::Bytes;
 use std::{path::Path, time::Instant};
 
-/// Number of pairs of servers for each measurement. Which of two equal servers is faster depends on where the system
-/// places their threads. Therefore both servers are restarted for each pair, and the other program starts first in
-/// every second pair.
+/// Number of pairs of servers for each measurement. Even two equal servers differ in speed, depending on the cores on
+/// which the operating system runs their threads. Therefore both servers are restarted for each pair, and the order in
+/// which they start alternates.
 const PAIRS: usize = 6;
-/// Number of rounds with each pair.
+/// Number of rounds with each pair of servers.
 const ROUNDS: usize = 7;
-/// Environment steps in a round, and the number of workers. CartPole has more steps, because one takes less than a
-/// microsecond.
+/// Environment steps in a round, and the number of workers, for CartPole. There are more steps than for Hopper, because
+/// a step of CartPole takes less than a microsecond.
 const CART_POLE: (usize, usize) = (1 << 18, 1);
 const HOPPER: (usize, usize) = (1 << 13, 2);
 /// Number of round trips in a round with one environment.

@@ -1,4 +1,5 @@
-//! The cost of disturbances: the steps of a batch with delays and noise, compared with the same batch without.
+//! The cost of disturbances: the steps of a batch with delays and noise, compared with the same batch without
+//! disturbances.
 
 use super::{
     Failure, ROUNDS,

@@ -5,8 +5,8 @@
 //! - `step/folder/Walker2d`, `Ant` and `Humanoid`: Gymnasium's tasks with 64 environments. Compares the server's CPU
 //!   time with a bare loop that makes the same number of calls to MuJoCo's functions: mj_step, and mj_rnePostConstraint
 //!   if contact forces are read.
-//! - `step/folder/lengths`: Walker2d on version R (random) with 64 environments. Compares a length that is drawn at
-//!   each reset with a fixed length, also in memory for each environment.
+//! - `step/folder/lengths`: Walker2d on version R (random) with 64 environments. Compares a thigh length that is drawn
+//!   at each reset with a fixed length. Also measures the memory that each environment takes.
 //!
 //! All measurements except the first need Gymnasium's models, in the folder that the environment variable
 //! `PERTURB_TEST_GYMNASIUM_ASSETS` names.
@@ -28,8 +28,8 @@ use tempfile::TempDir;
 
 const BATCH: usize = 64;
 const ROUNDS: usize = 11;
-/// Returns the number of environment steps in a round, by the estimated cost of one step. With a fixed number,
-/// Humanoid's round would take three seconds.
+/// Returns the number of environment steps in a round. It depends on the estimated cost of a step, because with the
+/// same number for all environments, Humanoid's round would take three seconds.
 fn steps_of_a_round(spec: &EnvironmentSpec) -> usize {
     const ROUND_US: f64 = 500_000.0;
     ((ROUND_US / spec.step_cost) as usize / BATCH).clamp(16, 128) * BATCH
@@ -215,11 +215,12 @@ async fn beside_mujoco(id: &str, path: &Path, mjcf: &str, external_forces: bool)
     Ok(())
 }
 
-/// The state of an environment before a round. For each episode that began in the round follow the number of steps
-/// before it and its initial state.
+/// The start of an environment's round: the state before the round, and a list of the episodes that began in the round.
+/// An episode is given by the number of the round's steps before it, and by its initial state.
 type RoundStart = (Vec<f64>, Vec<(usize, Vec<f64>)>);
 
-/// Environments with the same seed as the server's, in this process, and a simulation that repeats their physics alone.
+/// Environments in this process, with the same seed as the server's environments, and a simulation that repeats only
+/// their physics.
 struct Bare {
     spec: &'static EnvironmentSpec,
     episodes: Vec<Episodes>,

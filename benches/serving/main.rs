@@ -3,13 +3,13 @@
 //! - CartPole, batch of 256, over a Unix socket; reference: a plain tonic echo server with replies of the same size;
 //! - Hopper and HalfCheetah, batches of 64, 256 and 1024, two workers; reference: only MuJoCo's timesteps ([`robots`]);
 //! - tasks that are loaded from folders; reference: the built-in Hopper, and only MuJoCo's functions ([`folder`]);
-//! - CartPole over TCP with TLS; reference: without TLS ([`encrypted`]);
+//! - CartPole over TCP with TLS; reference: TCP without TLS ([`encrypted`]);
 //! - many concurrent sessions with several transport threads, only if requested by name ([`sessions`]);
 //! - the round-trip time of one environment, and the memory of one Hopper;
 //! - CartPole, 8 environments in which the server acts with a policy; reference: only computing the actions
 //!   ([`acting`]);
-//! - each environment, batch of 64, with delayed and noisy actions and observations; reference: without
-//!   ([`disturbed`]);
+//! - each environment, batch of 64, with delayed and noisy actions and observations; reference: the same batch without
+//!   delay and noise ([`disturbed`]);
 //! - this server, compared with another executable of it ([`compare`]);
 //! - rendered pictures of each environment, 480 × 480 pixels, and the growth of the server's memory.
 //!

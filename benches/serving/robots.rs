@@ -2,7 +2,8 @@
 //!
 //! The results are the server's CPU time for each environment step, and its steps per second. The reference is a bare
 //! loop: MuJoCo's timesteps (mj_step) of the same environments with the same actions, one environment after the other.
-//! The environments' own timesteps take less time, because they skip a search and visit bodies in one pass.
+//! A timestep of the environments takes less time than mj_step, because it skips MuJoCo's search for nearby geoms and
+//! visits all bodies in one pass.
 //!
 //! A server with two workers is measured in a closed loop, where each request waits for the previous reply, and with
 //! two requests in flight. Server and bare loops are measured in alternating rounds with the same steps. The output has
@@ -82,7 +83,7 @@ pub(crate) async fn measure(spec: &'static EnvironmentSpec, make: MakeRobot, bat
     Ok(())
 }
 
-/// The costs of the same steps, computed in different ways.
+/// The costs of a round's steps, which are computed in several ways.
 struct RoundCosts {
     bare: Cost,
     /// Two bare loops at the same time, with half of the environments each.
@@ -138,7 +139,7 @@ fn at_once(halves: &mut [LocalEnvironments; 2], actions: &[Bytes]) -> Result<Cos
     Ok(Cost { cpu: a? + b?, wall: start.elapsed().as_secs_f64() })
 }
 
-/// Some of a batch's environments in this process, and the simulation of their bare loop.
+/// A part of a batch's environments, in this process, with the simulation of their bare loop.
 struct LocalEnvironments {
     spec: &'static EnvironmentSpec,
     first: usize,
@@ -146,10 +147,11 @@ struct LocalEnvironments {
     observations: Vec<f32>,
     /// The simulation of the bare loop.
     simulation: Simulation,
-    /// The states of each environment before and after the round.
+    /// MuJoCo's state of each environment before and after the bare loop's round.
     states: Vec<(Vec<f64>, Vec<f64>)>,
     initial: Vec<f64>,
-    /// The episodes that began in the round: index of the environment, step, and initial state.
+    /// The episodes that began in the round: index of the environment, index of the step after which the episode began,
+    /// and initial state.
     begun: Vec<(usize, usize, Vec<f64>)>,
 }
 

@@ -24,12 +24,12 @@ use std::{
 const BATCH: usize = 16;
 const SESSIONS: [usize; 5] = [1, 4, 16, 64, 256];
 const TRANSPORT_THREADS: [usize; 3] = [1, 2, 4];
-/// The time at the start that is not measured.
+/// The time at the start of a run during which requests are not measured.
 const WARM_UP: Duration = Duration::from_millis(500);
-/// The time that is measured.
+/// The time after [`WARM_UP`] during which requests are measured.
 const MEASURED: Duration = Duration::from_secs(2);
 
-/// Measures each combination for whose id `wanted` returns true.
+/// Measures each combination of settings for whose id `wanted` returns true.
 pub(crate) fn measure(wanted: impl Fn(&str) -> bool) -> Result<(), Failure> {
     let directory = tempfile::tempdir()?;
     let files = certificates(directory.path());

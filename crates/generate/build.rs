@@ -5,11 +5,11 @@ use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::{env, fs, panic};
 
-/// The .proto files with services, and those with messages that are sent inside `google.protobuf.Any`. Paths are
-/// relative to `proto`.
+/// The .proto files from which code is generated, with paths relative to `proto`: files with services, and a file with
+/// messages that are sent inside `google.protobuf.Any`.
 const PROTOCOLS: [&str; 3] =
     ["perturb/v1/perturb.proto", "dm_env_rpc/v1/dm_env_rpc.proto", "dm_env_rpc/v1/extensions/properties.proto"];
-/// Messages of `perturb.v1` that the JSON catalogue contains, and that need a serialiser.
+/// Messages of `perturb.v1` that need a JSON serialiser, because the JSON catalogue contains them.
 const SERIALIZED: [&str; 3] = ["Channel", "RewardTerm", "Quantity"];
 
 fn main() -> Result<(), Box<dyn Error>> {
@@ -57,7 +57,7 @@ fn generate_bindings(root: &Path, out: &Path) -> Result<(), Box<dyn Error>> {
         .allowlist_var("mjVERSION_HEADER|mjNGAIN|mjNBIAS")
         .generate_comments(false)
         .rustfmt_configuration_file(Some(root.join("rustfmt.toml").canonicalize()?));
-    // bindgen panics if libclang is missing. The hook suppresses the backtrace.
+    // bindgen panics if libclang is missing. This hook suppresses the panic's message and backtrace.
     panic::set_hook(Box::new(|_| {}));
     let generated = panic::catch_unwind(panic::AssertUnwindSafe(|| builder.generate()));
     drop(panic::take_hook());

@@ -24,11 +24,11 @@ fn main() {
     shim.files(["src/shim.c", "src/kinematics.c"]).include(&include).std("c11").opt_level(2);
     // kinematics.c must give the same bytes as Debian's MuJoCo, which is built without fused multiply-add.
     shim.flag("-ffp-contract=off").compile("perturb_mujoco_shim");
-    // The linker needs a library after the code that uses it, so MuJoCo comes after the shim.
+    // The linker must see a library after the code that uses it, so MuJoCo is linked after the shim.
     println!("cargo:rustc-link-lib=dylib=mujoco");
 }
 
-/// Prints a message and ends the build.
+/// Prints `sentence` as an error message and ends the build.
 fn fail(sentence: String) -> ! {
     eprintln!("{sentence}");
     process::exit(1)

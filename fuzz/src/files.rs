@@ -16,9 +16,11 @@ use crate::seeds::{stored_policy, stored_records};
 /// Maximum size of an experiment file, in bytes. Larger files would only take more time.
 const MAX_PLAN_BYTES: usize = 4096;
 
-/// Loads a checkpoint. The input is the length of `checkpoint.json` in two bytes, this file, and the weights.
+/// Loads a checkpoint. The input consists of the length of `checkpoint.json` in two bytes, the text of
+/// `checkpoint.json`, and the file of the weights.
 ///
-/// Corrects the checksums, as an attacker would do. If the checkpoint loads, creates a player from it.
+/// Corrects the checksums in the input, as an attacker would do. If the checkpoint can be loaded, creates a player from
+/// it.
 pub fn checkpoints(data: &[u8]) {
     let Some((length, rest)) = data.split_first_chunk::<2>() else { return };
     let (document, weights) = rest.split_at(usize::from(u16::from_le_bytes(*length)).min(rest.len()));
@@ -51,7 +53,8 @@ pub fn records(data: &[u8]) {
     }
 }
 
-/// Reads the lines of a ledger, after adding valid digests. If the ledger is valid, audits a stored policy with it.
+/// Reads the lines of a ledger, after adding valid digests to them. If the ledger is valid, audits a stored policy with
+/// it.
 pub fn ledgers(data: &[u8]) {
     static POLICY_WITH_RECORDS: LazyLock<(Checkpoint, Records)> = LazyLock::new(|| (stored_policy(), stored_records()));
     let Ok(text) = std::str::from_utf8(data) else { return };

@@ -22,7 +22,8 @@ pub fn tasks(data: &[u8]) {
     environment.load(&state).expect("what was saved");
 }
 
-/// Reads a model up to the call of MuJoCo's compiler. The compiler may abort, and therefore runs in a separate process.
+/// Reads a task's model, but does not compile it. MuJoCo's compiler may abort the process, and therefore perturb runs
+/// it in a separate process.
 pub fn models(data: &[u8]) {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::write(folder.path().join("task.toml"), "").expect("a file");

@@ -1,4 +1,4 @@
-//! Fuzz targets for the server. It runs in this process and listens on a Unix socket.
+//! Fuzz targets for the server, which runs in this process and listens on a Unix socket.
 //!
 //! After each input, another client, the bystander, runs fixed sessions of both robots and a classic task. It must
 //! always get the same bytes.
@@ -19,7 +19,8 @@ use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::net::UnixStream;
 use tokio::runtime::{Builder, Runtime};
 
-/// Maximum time until the server replies, for a busy machine and a sanitizer.
+/// Maximum time until the server replies. It is long, because the machine may be busy and a sanitizer makes the server
+/// slow.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(60);
 /// Time without output after which a client is taken to have sent everything.
 const CLIENT_SILENCE: Duration = Duration::from_millis(300);
@@ -35,8 +36,8 @@ pub fn requests(data: &[u8]) {
     attack(|socket| exchange(socket, SESSION, data.to_vec()));
 }
 
-/// Restores a snapshot. The input is a byte that selects an environment, and a snapshot without its checksum, which is
-/// added. Then steps the restored environment.
+/// Restores a snapshot and steps the restored environment. The input is a byte that selects an environment, and a
+/// snapshot without its checksum. This function adds the checksum.
 pub fn snapshots(data: &[u8]) {
     let Some((&choice, snapshot)) = data.split_first() else { return };
     let environments = tasks::catalogue();
@@ -53,7 +54,7 @@ pub fn worlds(data: &[u8]) {
     attack(|socket| exchange(socket, PROCESS, data.to_vec()));
 }
 
-/// Opens a connection and sends `data` as all its bytes.
+/// Opens a connection and sends the bytes `data`, without the framing of HTTP/2 or gRPC.
 pub fn connections(data: &[u8]) {
     attack(async |socket| {
         let mut connection = UnixStream::connect(socket).await.expect("the server listens");
@@ -185,7 +186,7 @@ pub(crate) fn client_bytes(body: &[u8]) -> Vec<u8> {
         tokio::spawn(async move { call(ours, SESSION, body).await });
         let mut sent = vec![0; 1 << 16];
         let mut length = 0;
-        // When the client waits, it has sent everything.
+        // If the client sends nothing for this time, it has sent everything.
         while let Ok(Ok(more)) = tokio::time::timeout(CLIENT_SILENCE, theirs.read(&mut sent[length..])).await {
             length += more;
         }

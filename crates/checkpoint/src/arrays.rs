@@ -45,8 +45,8 @@ pub fn encode(arrays: &[Array]) -> Result<Vec<u8>, String> {
     encode_with(arrays, "format", "perturb".to_owned())
 }
 
-/// Encodes `arrays` as a safetensors file with one entry of metadata. With several entries, their order would change
-/// from run to run.
+/// Encodes `arrays` as a safetensors file with one entry of metadata. There is only one, because safetensors would
+/// write several entries in an order that changes from run to run.
 fn encode_with(arrays: &[Array], key: &str, value: String) -> Result<Vec<u8>, String> {
     let views: Vec<(&str, TensorView<'_>)> = arrays
         .iter()

@@ -32,9 +32,9 @@ pub struct EnvironmentSummary {
 /// The name of the property `model_hash` in error messages.
 const MODEL: &str = "model";
 
-/// Returns advice for the user if the property `what` of a served environment differs. The advice stands before the
-/// other advice in an error message. It is empty unless `what` is the model: a different model may mean that the files
-/// in a task's folder have changed.
+/// Returns additional advice for the error message about the property `what`, which differs in a served environment.
+/// The advice is empty unless `what` is the model: a different model may mean that the files in a task's folder have
+/// changed.
 pub fn task_remedy(what: &str) -> &'static str {
     if what == MODEL { "if the task is a folder, serve its original files; otherwise " } else { "" }
 }
@@ -82,8 +82,8 @@ impl EnvironmentSummary {
     }
 
     /// Returns the first property that differs in `served`, with the values of both. Returns `None` if all are equal.
-    /// Disturbances are not compared, because they are not part of the environment; if a policy observes them, the
-    /// observations differ.
+    /// The names of disturbances among the parameters are not compared. If the policy observes disturbances, they are
+    /// found by the comparison of observations.
     pub fn difference(&self, served: &Self) -> Option<(&'static str, String, String)> {
         let both = |what, trained: &dyn fmt::Debug, served: &dyn fmt::Debug| {
             Some((what, format!("{trained:?}"), format!("{served:?}")))

@@ -40,7 +40,7 @@ pub use self::named::find as find_policy;
 const FORMAT_VERSION: u32 = 3;
 /// The first format version with a checksum.
 const SEALED: u32 = 3;
-/// Maximum number of attempts to read a checkpoint, in case a training replaces it during each attempt.
+/// Maximum number of attempts to read a checkpoint. An attempt fails if a training replaces the checkpoint meanwhile.
 const MAX_LOOKS: u32 = 20;
 /// The name of the JSON document; a directory that contains it is a checkpoint.
 pub const JSON: &str = "checkpoint.json";
@@ -364,15 +364,16 @@ impl State {
 }
 
 impl CheckpointDocument {
-    /// Reads `checkpoint.json` and passes it to `take`, which reads the files that the document names. If these files
-    /// are missing, because a training has replaced the checkpoint in the meantime, reads the new checkpoint.
+    /// Reads `checkpoint.json` and passes it to `take`, which reads the files that the document names. These files are
+    /// missing if a training has replaced the checkpoint meanwhile; this function then reads the new checkpoint.
     fn read_with<T>(path: &Path, mut take: impl FnMut(&Path, Self) -> Result<T>) -> Result<T> {
         let mut last = String::new();
         for _ in 1..MAX_LOOKS {
             let (directory, document) = Self::read(path)?;
             let named = document.weights.file.clone();
             match take(&directory, document) {
-                // A file that is missing twice was deleted, not replaced.
+                // Reads again if the weights are missing. If the document names the same file as in the previous
+                // attempt, the file was deleted and not replaced, so the error is returned.
                 Err(CheckpointError::File(error)) if error.source.kind() == ErrorKind::NotFound && named != last => {
                     last = named;
                 }

@@ -61,8 +61,9 @@ fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     let mut meant = of(&begins);
     if meant.is_empty() {
         let nearest = names::closest(name, all.iter().map(|kept| kept.id.as_str()));
-        // Ids have similar beginnings, so the name of a missing folder such as `hopper_run` resembles an id. A
-        // suggestion must also have about the same length, as a misspelled id does.
+        // A name that is not an id, such as the missing folder `hopper_run`, may resemble an id because their
+        // beginnings are similar. A misspelled id also has about the same length as the id, so only such an id is
+        // suggested.
         meant = of(&|id| nearest == Some(id) && id.len().abs_diff(name.len()) <= MAX_LENGTH_DIFFERENCE);
     }
     if meant.is_empty() {

@@ -6,14 +6,15 @@ use std::process::{Command, Stdio};
 /// Returns a command that runs `command` with a limit of file sizes, in blocks of 512 bytes. A write beyond the limit
 /// fails with "File too large".
 pub fn with_file_limit(command: &Command, blocks: u32) -> Command {
-    // Without the trap, the signal SIGXFSZ would end the command.
+    // The trap makes the command ignore the signal SIGXFSZ, which would end it at the limit.
     let script = "trap '' XFSZ; ulimit -f \"$1\"; shift; exec \"$@\"";
     in_shell(command, Command::new("sh").args(["-c", script, "sh", &blocks.to_string()]))
 }
 
-/// Returns a command that runs `command` twice: first with a disk of `kilobytes` mounted at `folder`, then with more
-/// space on it. At the end the contents of the folder are copied to `copy`. Between the runs, a line with the exit
-/// status of the first one is written to standard error. Returns `None` if this user may not mount disks.
+/// Returns a command that runs `command` twice with a disk mounted at `folder`. In the first run the disk has
+/// `kilobytes` of space, in the second run 1 GiB. Between the runs the returned command writes the first exit status to
+/// standard error. At the end it copies the contents of the folder to `copy`. Returns `None` if this user may not mount
+/// disks.
 pub fn on_full_then_free_disk(command: &Command, folder: &Path, kilobytes: u32, copy: &Path) -> Option<Command> {
     const NAMESPACE: [&str; 2] = ["--map-root-user", "--mount"];
     let mount = Command::new("unshare").args(NAMESPACE).args(["mount", "-t", "tmpfs", "tmpfs"]).arg(folder).status();
@@ -30,7 +31,7 @@ pub fn on_full_then_free_disk(command: &Command, folder: &Path, kilobytes: u32, 
     Some(in_shell(command, &mut shell))
 }
 
-/// Returns a command that runs `shell` with `command` as its last arguments.
+/// Returns a command that runs `shell`, with the program and the arguments of `command` appended to its arguments.
 fn in_shell(command: &Command, shell: &mut Command) -> Command {
     let mut whole = Command::new(shell.get_program());
     whole.args(shell.get_args()).arg(command.get_program()).args(command.get_args());

@@ -2,7 +2,7 @@
 //!
 //! - [`proxy`]: a proxy that delays, drops and changes bytes, and closes connections.
 //! - [`certificates`]: valid and invalid certificates.
-//! - [`rng`]: random faults and pauses from a seed, which is printed.
+//! - [`rng`]: random faults and pauses from a seed. The seed is printed, so that a failure can be repeated.
 //! - [`disk`]: commands that run with a full disk.
 
 pub mod certificates;

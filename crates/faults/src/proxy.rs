@@ -13,13 +13,13 @@ use std::time::{Duration, Instant};
 /// The kind of a fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FaultKind {
-    /// Flips the lowest bit of the byte.
+    /// Flips the lowest bit of the byte at the fault's index.
     BitFlip,
-    /// Closes both directions before the byte.
+    /// Closes both directions of the connection. The byte and all later bytes are lost.
     Close,
-    /// Drops this byte and all later bytes of this direction, without closing the connection.
+    /// Drops the byte and all later bytes of the same direction, without closing the connection.
     Blackhole,
-    /// Closes this direction before the byte. The other direction stays open.
+    /// Closes the direction of the byte, and loses the byte and all later bytes. The opposite direction stays open.
     HalfClose,
 }
 
@@ -78,7 +78,7 @@ impl FaultyProxy {
         thread::spawn(move || {
             for client in listener.incoming().flatten() {
                 let number = counts.connections.fetch_add(1, Ordering::Relaxed);
-                // On an error, for instance if the server does not accept, the client's connection is closed.
+                // If the server does not accept the connection, this closes the client's connection.
                 let _ = server.connect().and_then(|server| connect(client, server, plan(number), &counts));
             }
         });
@@ -203,7 +203,7 @@ fn forward(
                 FaultKind::HalfClose => to.end(Shutdown::Write),
                 FaultKind::Blackhole => {}
             }
-            // The rest is read and dropped, so that the sender does not notice the fault.
+            // Reads and drops all later bytes, so that the sender does not notice the fault.
             for _ in &chunks {}
             return;
         }
@@ -218,7 +218,7 @@ mod tests {
 
     /// Maximal time to wait for delayed bytes.
     const DEADLINE: Duration = Duration::from_secs(60);
-    /// Time without bytes after which the connection counts as silent.
+    /// Time to wait for more bytes before a test concludes that no more bytes come.
     const SILENCE: Duration = Duration::from_millis(300);
 
     /// Sends `0123456789` through a proxy to an echo server. Returns the echoed bytes, and whether the connection was

@@ -51,8 +51,9 @@ impl SeededRng {
 
     /// Returns a random fault of one of these kinds, at a byte before `end`.
     ///
-    /// Early bytes are more likely, roughly by the logarithm of their index: bytes 100 to 1000 together are as likely
-    /// as bytes 1000 to 10 000. The reason is that most of the negotiation happens in the first bytes of a connection.
+    /// The logarithm of the byte's index is roughly uniform, so early bytes are more likely: a fault in the bytes 100
+    /// to 1000 is as likely as one in the bytes 1000 to 10 000. Most negotiation happens in the first bytes of a
+    /// connection.
     pub fn fault(&mut self, kinds: &[FaultKind], end: u64) -> ByteFault {
         let kind = kinds[self.below(kinds.len() as u64) as usize];
         let digits = u64::from(end.max(2).ilog2());

@@ -52,7 +52,8 @@ fn checksum(document: &Value) -> u32 {
     crc32c::crc32c(document.to_string().as_bytes())
 }
 
-/// Inserts the checksum of `file` at the byte offset `place`, which the file's readers must ignore.
+/// Inserts the checksum of `file` at the byte offset `place`. Readers of the file's format must ignore additional bytes
+/// at this offset.
 pub fn insert(file: &mut Vec<u8>, place: usize) {
     let digits = format!("{:0DIGITS$x}", crc32c::crc32c(file));
     file.splice(place..place, [MARK, digits.as_bytes()].concat());

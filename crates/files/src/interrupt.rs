@@ -85,7 +85,7 @@ impl StopFlag {
 /// The signals with which users and systems ask a program to end.
 const ENDING: [SignalKind; 2] = [SignalKind::interrupt(), SignalKind::terminate()];
 
-/// Makes SIGINT and SIGTERM end the program immediately. For programs that have nothing to complete.
+/// Makes SIGINT and SIGTERM end the program immediately. Use it in programs that have no work to complete at the end.
 ///
 /// # Errors
 /// An error of the operating system.

@@ -42,8 +42,8 @@ pub struct FileError {
 }
 
 impl FileError {
-    /// Returns whether the machine is at fault, e.g. because of a full disk or a lost mount, rather than the content of
-    /// a folder.
+    /// Returns whether the cause is a fault of the machine, e.g. a full disk or a lost mount. Otherwise the cause is
+    /// the content of a folder, e.g. a missing file.
     pub fn is_fault(&self) -> bool {
         use ErrorKind::{AlreadyExists, InvalidData, InvalidInput, IsADirectory, NotADirectory, NotFound};
         let kind = self.source.kind();
@@ -63,7 +63,7 @@ pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> F
 /// Reads a regular file, which must exist.
 ///
 /// # Errors
-/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than 1 GiB.
+/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_if_there(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
 }
@@ -71,8 +71,8 @@ pub fn read(path: &Path) -> Result<Vec<u8>> {
 /// Reads the text of a TOML file.
 ///
 /// # Errors
-/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than
-/// [`MAX_TOML_BYTES`] or is not UTF-8.
+/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than
+/// [`MAX_TOML_BYTES`] or not UTF-8.
 pub fn read_toml(path: &Path) -> Result<String> {
     read_plain_text(path, MAX_TOML_BYTES)
 }
@@ -80,7 +80,7 @@ pub fn read_toml(path: &Path) -> Result<String> {
 /// Reads a regular file. Returns `None` if it does not exist.
 ///
 /// # Errors
-/// An error of the operating system. Also if the path is a pipe or a device, or if the file has more than 1 GiB.
+/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
 pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
     read_plain(path, plain::MAX_BYTES)
 }
@@ -114,7 +114,7 @@ pub fn create_folder(path: &Path) -> Result<()> {
     fs::create_dir_all(path).map_err(io("create", path))
 }
 
-/// Returns the sorted paths of everything in a folder. Returns none if the folder does not exist.
+/// Returns the sorted paths of all files and folders in a folder; an empty list if the folder does not exist.
 ///
 /// # Errors
 /// An error of the operating system.
@@ -255,13 +255,14 @@ pub fn write_json(path: &Path, document: &impl Serialize) -> Result<()> {
     write_atomically(path, &text)
 }
 
-/// Flushes the names in a folder to the disk, if the file system supports this.
+/// Flushes the list of a folder's files to the disk, if the file system supports this. Without it, a new or renamed
+/// file may be lost if the machine crashes.
 ///
 /// # Errors
 /// An error of the operating system.
 pub fn sync_folder(path: &Path) -> Result<()> {
     let synced = match File::open(path) {
-        // A folder may be writable without being readable.
+        // A folder that is writable but not readable cannot be opened, and is not flushed.
         Err(error) if error.kind() == ErrorKind::PermissionDenied => Ok(()),
         opened => opened.and_then(|folder| folder.sync_all()),
     };

@@ -12,9 +12,9 @@ use super::{Result, io};
 
 /// The name of the file that is locked in place of its folder, because NFS on Linux cannot lock a folder.
 const LOCK_FILE: &str = "lock";
-/// Maximum number of attempts to take a lock, while another process only tests it.
+/// Maximum number of attempts to take a lock that another process is only testing.
 const MAX_LOCK_TRIES: u32 = 100;
-/// Time between two attempts. A test takes some microseconds.
+/// Time between two attempts to take a lock. Another process's test of the lock takes some microseconds.
 const LOCK_RETRY_INTERVAL: Duration = Duration::from_millis(1);
 
 /// An advisory lock of a folder. The operating system releases it when the process ends for any reason.
@@ -47,8 +47,8 @@ impl Lock {
             if exclusive != Some(false) {
                 return Ok(Some(Self(file)));
             }
-            // A lock that is held is exclusive, while a test uses a shared lock. So if a shared lock is possible,
-            // another process only tests.
+            // A process that holds the lock has it exclusively, while a test uses a shared lock. If this process can
+            // get a shared lock, no process holds the lock, and another process is only testing it.
             match is_taken(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
                 Some(true) => file.unlock().map_err(io("unlock", &path))?,
                 _ => return Ok(None),

@@ -58,7 +58,7 @@ impl Stamp {
 /// Reads a regular file of at most `most` bytes. Returns `None` if it does not exist.
 ///
 /// # Errors
-/// An error of the operating system. Also if the file is not regular, or longer than `most`.
+/// An error of the operating system, or an error if the file is not regular or longer than `most`.
 pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
     if_there(perturb_system::read_plain(path, most)).map_err(io("read", path))
 }
@@ -66,14 +66,14 @@ pub fn read_plain(path: &Path, most: u64) -> Result<Option<Vec<u8>>> {
 /// Reads a regular file of at most `most` bytes as UTF-8 text.
 ///
 /// # Errors
-/// The errors of [`read_plain`]. Also if the file does not exist or is not UTF-8.
+/// The errors of [`read_plain`], or an error if the file does not exist or is not UTF-8.
 pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
     let content = read_plain(path, most)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))?;
     String::from_utf8(content).map_err(|error| io("read", path)(Error::new(ErrorKind::InvalidData, error.utf8_error())))
 }
 
-/// Returns whether the path `name` in `folder` passes a symbolic link that leads outside of `root`, or to a hidden file
-/// or folder in it. `folder` must be inside of `root` and must not contain symbolic links.
+/// Returns whether the path `name` in `folder` passes a symbolic link that leads out of `root`, or to a hidden file or
+/// folder in `root`. `folder` must be inside of `root` and must not contain symbolic links.
 pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
     let mut path = folder.to_owned();
     name.as_ref().components().any(|component| {

@@ -1,8 +1,8 @@
 //! Import cycles between sibling modules.
 //!
-//! The imports form a graph of sibling modules. An import of `a::b` from `a::c::d` is an edge from `a::c` to `a::b`:
-//! both paths are shortened to the first level at which they differ. Imports between a module and its own parent are
-//! not edges.
+//! The imports form a graph of sibling modules, i.e. modules with the same parent. An import of `a::b` from `a::c::d`
+//! is an edge from `a::c` to `a::b`: both paths are cut after the first name that differs. Imports between a module and
+//! its own parent are not edges.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
@@ -16,7 +16,7 @@ pub struct Cycle {
     pub folder: String,
     /// The path of the modules' common parent; empty for the crate's root.
     pub parent: ModulePath,
-    /// The number of the parent's child modules that import each other at all.
+    /// The number of the parent's child modules that import another child module or are imported by one.
     pub siblings: usize,
     /// The names of all modules of the cycle, in alphabetical order.
     pub modules: Vec<String>,
@@ -55,7 +55,7 @@ impl fmt::Display for Cycle {
     }
 }
 
-/// Finds all cycles of a package. Cycles of outer modules come first.
+/// Finds all cycles of a package. Cycles among modules close to the root come first.
 pub fn find(package: &PackageImports) -> Vec<Cycle> {
     let mut levels: BTreeMap<(usize, &[String]), SiblingGraph> = BTreeMap::new();
     for import in &package.imports {

@@ -15,7 +15,7 @@ pub const OPENINGS: [&str; 22] = [
 /// The first line of a doc comment.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DocComment {
-    /// The folder in whose count the comment is included.
+    /// The folder to which the comment is counted, see [`folder_of`].
     pub folder: String,
     /// The file with the comment.
     pub file: String,

@@ -1,4 +1,5 @@
-//! A lexer for Rust. It divides source text into tokens, so that comments and strings are not mistaken for code.
+//! A lexer for Rust. It divides source text into tokens, so that the checks do not mistake comments and strings for
+//! code.
 
 /// A token with the line where it starts.
 #[derive(Clone, Debug, PartialEq, Eq)]

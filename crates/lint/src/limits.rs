@@ -89,7 +89,7 @@ impl Check {
     }
 }
 
-/// The result of one check in one folder.
+/// The result of one check in one folder, which is compared with a limit.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Finding {
     /// The check.
@@ -141,8 +141,8 @@ impl LimitTable {
         limit.unwrap_or(0.0).max(check.default_limit())
     }
 
-    /// Returns these limits, lowered to the current number of findings where that is smaller. No limit rises. Omits
-    /// limits that equal the default.
+    /// Returns the limits with each reduced to the current number of findings, if this number is smaller. No limit
+    /// rises. Omits limits that equal the default.
     pub fn lowered_to(&self, findings: &[Finding]) -> Self {
         let mut limits = Self::default();
         for finding in findings {
@@ -217,7 +217,7 @@ struct KeyValue {
     line: usize,
 }
 
-/// Parses lines `key = value`, with the section of each. Removes quotation marks around keys and values.
+/// Parses lines `key = value`, and stores the section of each line. Removes quotation marks around keys and values.
 fn entries(text: &str) -> Result<Vec<KeyValue>, String> {
     let mut section = String::new();
     let mut entries = Vec::new();
@@ -328,7 +328,7 @@ pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemp
             verdict.errors.push(describe(finding, limit));
         }
     }
-    // Warns of limits above the number of findings.
+    // Adds a warning for each limit that is above the number of findings.
     let found: BTreeMap<_, _> =
         findings.iter().map(|finding| ((finding.check.section(), finding.folder.as_str()), finding.count)).collect();
     for (section, folders) in &limits.0 {
@@ -341,7 +341,8 @@ pub fn judge(tree: &SourceTree, findings: &[Finding], limits: &LimitTable, exemp
             }
         }
     }
-    // Warns of exemptions and glossary entries for types that no longer exist or are no longer defined twice.
+    // Adds a warning for each exemption or glossary entry whose type no longer exists, and for each exemption of a type
+    // that is no longer defined twice.
     let names = names::read(tree);
     let twice: BTreeSet<_> = names::defined_twice(&names.types).into_keys().collect();
     for name in exemptions.duplicates.keys().filter(|name| !twice.contains(name.as_str())) {

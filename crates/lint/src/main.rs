@@ -72,7 +72,7 @@ fn list(folder: &str) -> Result<(), String> {
             text += &format!("  {place}\n");
         }
     }
-    // An error means that the reader has closed the pipe and needs no more output.
+    // Ignores errors: the program that reads the output has closed the pipe and needs no more output.
     let _ = std::io::stdout().write_all(text.as_bytes());
     Ok(())
 }

@@ -28,7 +28,7 @@ pub struct Definition {
 pub struct NameDefinitions {
     /// Structs, enums, traits, classes and type aliases of modules, except in tests, benchmarks and examples.
     pub types: Vec<Definition>,
-    /// The Rust types among `types` that are `pub`, not for example `pub(crate)`.
+    /// The Rust types among `types` that are `pub`. Types that are `pub(crate)` are left out.
     pub public_types: Vec<Definition>,
     /// Constants and statics whose first word is one of [`SUPERLATIVES`], except in tests.
     pub superlatives: Vec<Definition>,
@@ -50,7 +50,7 @@ pub fn read(tree: &SourceTree) -> NameDefinitions {
     names
 }
 
-/// Returns the types that are defined in more than one file of the same language. For each name, lists all definitions.
+/// Returns the type names that are defined in more than one file of the same language, each with all its definitions.
 ///
 /// Rust and Python types may have the same name, because a class often corresponds to a struct.
 pub fn defined_twice(types: &[Definition]) -> BTreeMap<&str, Vec<&Definition>> {

@@ -91,8 +91,8 @@ pub fn is_benchmark_or_example(path: &str) -> bool {
     path.split('/').any(|folder| matches!(folder, "benches" | "benchmarks" | "examples"))
 }
 
-/// Returns the folder in whose count a file is included: the first two levels in `src`, `crates` and `python`,
-/// otherwise only the top level.
+/// Returns the folder to which the findings in a file are counted. This is a folder of the second level in `src`,
+/// `crates` and `python`, and otherwise a folder of the top level.
 ///
 /// Files in the repository's root are counted for `.`.
 pub fn folder_of(path: &str) -> &str {

@@ -12,7 +12,7 @@ enum Status {
     Sound,
     /// MuJoCo raised this warning. Calls that compute are refused until the next reset.
     Diverged(Warning),
-    /// A fatal error interrupted a computation. The data stay unusable for ever.
+    /// A fatal error interrupted a computation. The simulation can never be used again.
     Poisoned,
 }
 
@@ -40,8 +40,7 @@ pub struct Simulation {
 // SAFETY: mjData and the pairs are plain memory without ties to a thread, and only `Simulation` owns them. A call uses
 // the error handler of the calling thread, and removes it before it returns.
 unsafe impl Send for Simulation {}
-// SAFETY: nothing is written through `&Simulation`: the accessors only read, and mj_objectVelocity takes const
-// pointers.
+// SAFETY: nothing is written through `&Simulation`. Its methods only read, and mj_objectVelocity takes const pointers.
 unsafe impl Sync for Simulation {}
 
 impl Simulation {
@@ -51,13 +50,13 @@ impl Simulation {
     /// [`Error::Fatal`] if there is not enough memory.
     pub fn new(model: Model) -> Result<Self, Error> {
         let data = make_data(&model)?;
-        // SAFETY: the model is valid and only read. The pairs point into its memory, which does not move, and `model`
-        // lives as long as they do. The result is new, or null.
+        // SAFETY: the model is valid, and the function only reads it. The pairs point into the model's memory, which
+        // does not move and lives as long as the pairs. The function returns new memory or null.
         let pairs = NonNull::new(unsafe { sys::perturb_mj_make_pairs(model.as_ptr()) });
         Ok(Self { model, data, pairs, status: Status::Sound })
     }
 
-    /// The model, with the edits that were made.
+    /// The model, including edits such as those by [`field_mut`](Self::field_mut).
     pub fn model(&self) -> &Model {
         &self.model
     }
@@ -75,8 +74,8 @@ impl Simulation {
         if self.status == Status::Poisoned {
             return Err(Error::Poisoned);
         }
-        // SAFETY: both models are valid and have the same sizes, and `&mut self` excludes other users of the one that
-        // is written. Its arrays do not move, so the pairs' pointers into them remain valid.
+        // SAFETY: both models are valid and have the same sizes. `&mut self` excludes other users of the model that is
+        // written. Its arrays do not move, so the pairs' pointers into them remain valid.
         let failed = unsafe { sys::perturb_mj_set_model(self.model.as_ptr(), source.as_ptr()) };
         self.poison_if(failed)
     }
@@ -126,8 +125,8 @@ impl Simulation {
         }
     }
 
-    /// The values of a field of the model, for editing. After editing masses, inertias, armatures or gears call
-    /// [`set_const`](Self::set_const).
+    /// The values of a field of the model, for editing. Call [`set_const`](Self::set_const) after editing masses,
+    /// inertias, armatures or gears.
     pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
         let (start, length) = self.model.place(field);
         self.array_mut(start, length)
@@ -168,7 +167,8 @@ impl Simulation {
         if self.status == Status::Poisoned {
             return Err(Error::Poisoned);
         }
-        // SAFETY: `data` belongs to `model` and is sound; `&mut self` excludes other users of both.
+        // SAFETY: `data` belongs to `model`, and no fatal error has damaged it. `&mut self` excludes other users of
+        // both.
         let failed = unsafe { sys::perturb_mj_set_const(self.model.as_ptr(), self.data.as_ptr()) };
         self.poison_if(failed)
     }
@@ -184,7 +184,8 @@ impl Simulation {
         if self.status == Status::Poisoned {
             return Err(Error::Poisoned);
         }
-        // SAFETY: as in `set_const`.
+        // SAFETY: `data` belongs to `model`, and no fatal error has damaged it. `&mut self` excludes other users of
+        // both.
         let failed = unsafe { sys::perturb_mj_reset(self.model.as_ptr(), self.data.as_ptr()) };
         self.poison_if(failed)?;
         self.status = Status::Sound;
@@ -209,8 +210,8 @@ impl Simulation {
         self.run(sys::perturb_mj_step2)
     }
 
-    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). Poses and contacts are afterwards
-    /// those of the state before the timestep.
+    /// Advances by one timestep: [`step1`](Self::step1), then [`step2`](Self::step2). Afterwards the poses and contacts
+    /// still belong to the state before the timestep.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -218,9 +219,9 @@ impl Simulation {
         self.run(sys::perturb_mj_step)
     }
 
-    /// Advances by one timestep with the same bytes as [`step`](Self::step). It is faster if each contact is between a
-    /// geom of the world and a geom of another body. Then it does not search for nearby geoms, for which MuJoCo
-    /// compares the bounding boxes of all pairs.
+    /// Advances by one timestep with the same bytes as [`step`](Self::step). It is faster if every possible contact is
+    /// between a geom of the world and a geom of another body. It then checks these pairs of geoms directly, without
+    /// MuJoCo's search for nearby geoms, which compares the bounding boxes of all pairs.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -250,7 +251,7 @@ impl Simulation {
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
     pub fn forward(&mut self) -> Result<(), Error> {
         self.run(sys::perturb_mj_forward)?;
-        // Unlike its steps, MuJoCo's forward computation does not check its numbers.
+        // mj_forward does not check that its numbers are finite; only MuJoCo's steps do.
         let finite = |values: &[f64]| values.iter().all(|value| value.is_finite());
         let warning = if !finite(self.qpos()) {
             Warning::BadPosition
@@ -303,8 +304,9 @@ impl Simulation {
         self.run_with(|model, data| unsafe { call(model, data) })
     }
 
-    /// Calls a function of `shim.c` with the model and its data, and returns its error or MuJoCo's warning. Refuses if
-    /// the simulation diverged or is poisoned. `&mut self` excludes other users.
+    /// Calls a function of `shim.c` with the model and its data, and returns the function's error or MuJoCo's warning.
+    /// Returns an error without a call if the simulation has diverged or is poisoned. `&mut self` excludes other users
+    /// of model and data.
     fn run_with(&mut self, call: impl FnOnce(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
         match self.status {
             Status::Sound => {}
@@ -313,7 +315,7 @@ impl Simulation {
         }
         let failed = call(self.model.as_ptr(), self.data.as_ptr());
         self.poison_if(failed)?;
-        // MuJoCo does not report bad numbers: it resets the state and counts a warning.
+        // If a number is not finite or too large, MuJoCo returns no error. It resets the state and counts a warning.
         match Warning::ALL.into_iter().find(|&warning| self.warnings(warning) != 0) {
             None => Ok(()),
             Some(warning) => {
@@ -472,8 +474,9 @@ impl Simulation {
     pub fn body_velocity(&self, body: usize) -> [f64; 6] {
         assert!(body < self.model.n_body(), "body {body} of {}", self.model.n_body());
         let mut velocity = [0.0; 6];
-        // SAFETY: `data` belongs to `model`, both only read; the body exists; the result has space for six numbers. The
-        // only fatal error of this function is an unknown kind of object.
+        // SAFETY: `data` belongs to `model`, and the function only reads both. The body exists, and the result has
+        // space for six numbers. The only fatal error of this function is an unknown kind of object, and a body is a
+        // known kind.
         unsafe {
             sys::mj_objectVelocity(
                 self.model.as_ptr(),
@@ -503,33 +506,36 @@ impl Simulation {
         unsafe { self.data.as_ref() }
     }
 
-    /// Returns an array of the data or of the model as a slice. `start` must be such an array with `length` elements.
+    /// Returns an array of the data or of the model as a slice. `start` must point to the array's first element, and
+    /// the array must have `length` elements.
     fn array<T>(&self, start: *mut T, length: usize) -> &[T] {
         if length == 0 {
             return &[]; // the pointer may be null
         }
-        // SAFETY: the caller passes an array of these data or of their model, with at most the length that MuJoCo
-        // allocated. It is initialised by mj_makeData or mj_loadXML, and lives unchanged as long as `self` is borrowed.
+        // SAFETY: the caller passes an array of the data or of the model, with at most the length that MuJoCo
+        // allocated. mj_makeData or mj_loadXML initialised the array. It lives and is not changed as long as `self` is
+        // borrowed.
         unsafe { slice::from_raw_parts(start, length) }
     }
 
-    /// Returns an array of the data or of the model as a slice for editing. `start` must be such an array with `length`
-    /// elements.
+    /// Returns an array of the data or of the model as a slice for editing. `start` must point to the array's first
+    /// element, and the array must have `length` elements.
     fn array_mut<T>(&mut self, start: *mut T, length: usize) -> &mut [T] {
         if length == 0 {
             return &mut []; // the pointer may be null
         }
-        // SAFETY: as in `array`; `&mut self` excludes other users. The callers expose only floating-point arrays. Any
-        // value in them is memory-safe, because MuJoCo uses none of them as an index.
+        // SAFETY: the array is valid for the reasons given in `array`, and `&mut self` excludes other users. The
+        // callers expose only floating-point arrays. Users may write any value into these arrays, because MuJoCo uses
+        // none of the values as an index.
         unsafe { slice::from_raw_parts_mut(start, length) }
     }
 }
 
 impl Drop for Simulation {
     fn drop(&mut self) {
-        // SAFETY: the data came from mj_makeData, are owned by `self`, and are freed once; also after a fatal error the
-        // two buffers that this frees are as mj_makeData left them. The pairs are owned by `self`, too, and MuJoCo
-        // keeps no pointer to them.
+        // SAFETY: the data came from mj_makeData, `self` owns them, and they are freed once. mj_deleteData frees two
+        // buffers, whose addresses do not change even in a fatal error. `self` also owns the pairs, and MuJoCo keeps no
+        // pointer to them.
         unsafe {
             sys::mj_deleteData(self.data.as_ptr());
             sys::perturb_mj_free_pairs(self.pairs.map_or(ptr::null_mut(), NonNull::as_ptr));
@@ -538,6 +544,6 @@ impl Drop for Simulation {
 }
 
 fn make_data(model: &Model) -> Result<NonNull<sys::mjData>, Error> {
-    // SAFETY: a valid model, only read; the result is new, or null.
+    // SAFETY: the model is valid, and the function only reads it. It returns new data or null.
     NonNull::new(unsafe { sys::perturb_mj_make_data(model.as_ptr()) }).ok_or_else(last_error)
 }

@@ -28,7 +28,7 @@ pub enum Error {
         /// The name that was requested.
         name: String,
     },
-    /// MuJoCo raised a fatal error. The simulation on which it worked is unusable from now on.
+    /// MuJoCo raised a fatal error. The simulation that was being computed can no longer be used.
     #[error("MuJoCo raised a fatal error: {message}")]
     Fatal {
         /// MuJoCo's message.
@@ -42,7 +42,7 @@ pub enum Error {
     NoOpenGl {
         /// The error of the dynamic loader, or the EGL call that failed.
         reason: String,
-        /// Whether the EGL library is installed. If so, another attempt may succeed.
+        /// Whether the EGL library is installed. If it is, another attempt may succeed.
         is_installed: bool,
     },
     /// MuJoCo raised a warning, so the simulated state is not reliable. MuJoCo may have replaced it with the initial

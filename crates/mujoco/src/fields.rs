@@ -2,7 +2,8 @@
 
 use crate::sys;
 
-/// Declares an enum of arrays of the model. Each variant has the array's name in MuJoCo and its number of elements.
+/// Declares an enum of arrays of the model. Each variant states the array's name in MuJoCo and the number of its
+/// elements.
 macro_rules! model_arrays {
     ($(#[$about:meta])* $name:ident: $type:ty, { $($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)* }) => {
         $(#[$about])*
@@ -57,16 +58,16 @@ macro_rules! float_fields {
                         let length: fn(&sys::mjModel) -> i32 = $length;
                         (m.$raw, length(m).max(0) as usize)
                     })*
-                    // SAFETY: the caller passes a valid model; only addresses are taken.
+                    // SAFETY: the caller passes a valid model. This takes only the address of the field.
                     Self::Gravity => (unsafe { &raw mut (*raw).opt.gravity }.cast(), 3),
-                    // SAFETY: as above.
+                    // SAFETY: the caller passes a valid model. This takes only the address of the field.
                     Self::Wind => (unsafe { &raw mut (*raw).opt.wind }.cast(), 3),
-                    // SAFETY: as above.
+                    // SAFETY: the caller passes a valid model. This takes only the address of the field.
                     Self::Density => (unsafe { &raw mut (*raw).opt.density }, 1),
-                    // SAFETY: as above.
+                    // SAFETY: the caller passes a valid model. This takes only the address of the field.
                     Self::Viscosity => (unsafe { &raw mut (*raw).opt.viscosity }, 1),
                     Self::Statistic => {
-                        // SAFETY: as above. The statistics are plain numbers of one type.
+                        // SAFETY: the caller passes a valid model. The statistics are seven successive f64.
                         let start = unsafe { &raw mut (*raw).stat }.cast();
                         (start, size_of::<sys::mjStatistic>() / size_of::<f64>())
                     }
@@ -191,9 +192,11 @@ model_arrays! {
         GeomType = geom_type: |m| m.ngeom,
         /// Index of each geom's body, `[geoms]`.
         GeomBody = geom_bodyid: |m| m.ngeom,
-        /// Contact types of geoms, `[geoms]`: bits that are compared with the other geom's contact affinity.
+        /// Contact types of geoms, `[geoms]`, as bits. Two geoms can touch if the contact type of one and the contact
+        /// affinity of the other have a bit in common.
         GeomContactType = geom_contype: |m| m.ngeom,
-        /// Contact affinities of geoms, `[geoms]`: bits that are compared with the other geom's contact type.
+        /// Contact affinities of geoms, `[geoms]`, as bits that are compared with contact types, see
+        /// [`Index::GeomContactType`].
         GeomContactAffinity = geom_conaffinity: |m| m.ngeom,
         /// Priorities of geoms, `[geoms]`. The geom of higher priority determines the parameters of a contact.
         GeomPriority = geom_priority: |m| m.ngeom,
@@ -241,8 +244,8 @@ model_arrays! {
 pub struct Options {
     /// The numerical integrator: 0 Euler, 1 RK4, 2 implicit.
     pub integrator: i32,
-    /// The geoms that are checked for collisions: 0 all, 1 only declared pairs, 2 only pairs found by their contact
-    /// types.
+    /// The pairs of geoms that are checked for collisions: 0 all, 1 only pairs that the model declares, 2 only pairs
+    /// that are found by their contact types.
     pub collision: i32,
     /// The disabled parts of the physics, as bits of MuJoCo's `mjtDisableBit`.
     pub disable_flags: i32,
@@ -276,7 +279,8 @@ macro_rules! data_arrays {
         }
 
         impl Reading {
-            /// A pointer to the first element of the array in a model's data, and the number of elements.
+            /// A pointer to the first element of the array in the data `d` of the model `m`, and the number of
+            /// elements.
             pub(crate) fn place(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {
                 match self {
                     $(Self::$field => {

@@ -14,7 +14,7 @@ use std::{
 type Egl = egl::DynamicInstance<egl::EGL1_4>;
 
 const LIBRARY: &str = "libEGL.so.1";
-/// Maximal number of graphics cards that are tried.
+/// Maximal number of graphics cards on which a context is tried.
 const MAX_DEVICES: usize = 32;
 
 // The EGL registry defines these numbers for EGL_EXT_platform_device and EGL_MESA_platform_surfaceless.
@@ -31,8 +31,8 @@ const CONFIG: [egl::Int; 15] = [
     egl::STENCIL_SIZE, 8,
     egl::NONE,
 ];
-/// Attributes of a surface of one pixel. Any context can be made current with it. Pictures are drawn into another
-/// buffer.
+/// Attributes of a surface of one pixel. It exists only because a context can be made current only with a surface.
+/// Pictures are drawn into another buffer.
 const SURFACE: [egl::Int; 5] = [egl::WIDTH, 1, egl::HEIGHT, 1, egl::NONE];
 /// Attributes of a context: none, which selects the compatibility profile that MuJoCo needs.
 const CONTEXT: [egl::Int; 1] = [egl::NONE];
@@ -49,12 +49,12 @@ fn library() -> Result<&'static Egl, Error> {
 }
 
 fn open(name: &str) -> Result<Egl, Error> {
-    // SAFETY: this loads the system's EGL library and runs its initialisers, as any program may, and its functions have
+    // SAFETY: this loads the system's EGL library, whose initialisers any program may run. The library's functions have
     // the types of the EGL registry.
     unsafe { Egl::load_required_from_filename(name) }.map_err(|error| {
         let reason = error.to_string();
-        // The dynamic loader reports a missing file with these words. Other errors, such as too little memory, may go
-        // away.
+        // The dynamic loader reports a missing file with these words. After other errors, such as too little memory,
+        // another attempt may succeed.
         let is_installed = !reason.contains("No such file or directory");
         Error::NoOpenGl { reason, is_installed }
     })
@@ -77,7 +77,8 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
         }
         let devices = devices.iter().take(usize::try_from(n).unwrap_or(0)).map(|&device| (PLATFORM_DEVICE, device));
         for (platform, native) in devices.chain([(PLATFORM_SURFACELESS, ptr::null_mut())]) {
-            // SAFETY: the device comes from EGL, or is null, as the other platform requires; there are no attributes.
+            // SAFETY: for PLATFORM_DEVICE the device comes from EGL. For PLATFORM_SURFACELESS it must be null. The null
+            // pointer to attributes means that there are none.
             let display = unsafe { get_platform_display(platform, native, ptr::null()) };
             if display != egl::NO_DISPLAY {
                 // SAFETY: the display comes from EGL.
@@ -85,7 +86,7 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
             }
         }
     }
-    // SAFETY: the default display may always be requested.
+    // SAFETY: EGL allows a request for the default display at any time.
     displays.extend(unsafe { egl.get_display(egl::DEFAULT_DISPLAY) });
     displays
 }
@@ -93,8 +94,8 @@ fn displays(egl: &Egl) -> Vec<egl::Display> {
 /// An OpenGL context without a display. It can only be used in the thread that created it.
 pub(crate) struct Gl {
     egl: &'static Egl,
-    // Surface and context are valid as long as this value, the display for ever. They are raw pointers, so this type is
-    // not `Send`.
+    // Surface and context are valid as long as this value, and the display is valid until the process ends. They are
+    // raw pointers, so this type is not `Send`.
     display: egl::Display,
     surface: egl::Surface,
     context: Option<egl::Context>,
@@ -139,7 +140,7 @@ impl Gl {
 
 impl Drop for Gl {
     fn drop(&mut self) {
-        // Failures are ignored: they have no consequence, and `drop` cannot report them.
+        // Failures are ignored, because they do no harm and `drop` cannot report them.
         let _ = self.egl.make_current(self.display, None, None, None);
         if let Some(context) = self.context {
             let _ = self.egl.destroy_context(self.display, context);

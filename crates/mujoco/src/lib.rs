@@ -22,17 +22,17 @@
 //!
 //! # Threads
 //!
-//! Different models and simulations may be used in different threads at the same time. MuJoCo's engine has little state
-//! outside `mjModel` and `mjData`: error handlers, which the C code in `shim.c` installs per thread and per call,
-//! callbacks, which this crate never sets, and the addresses of OpenGL's functions. Only the MJCF compiler and drawing
-//! are not thread-safe. This crate serialises them by mutexes.
+//! Different models and simulations may be used in different threads at the same time. Outside `mjModel` and `mjData`,
+//! MuJoCo's engine has only three kinds of state. The C code in `shim.c` installs error handlers for each thread and
+//! call. Callbacks are never set by this crate. The addresses of OpenGL's functions are used only for drawing. The MJCF
+//! compiler and drawing are not thread-safe, so this crate guards them by mutexes.
 //!
 //! # Fatal errors
 //!
-//! MuJoCo handles a fatal error by ending the process. Here each call runs under `setjmp` in `shim.c`, and the error
-//! handler jumps back there. The jump crosses only C frames of MuJoCo's engine, never Rust frames or those of the MJCF
-//! compiler, which is C++. The interrupted call leaves `mjData` in an undefined state. So the [`Simulation`] refuses
-//! all further calls, and the caller must make a new one.
+//! By default MuJoCo ends the process at a fatal error. In this crate each call runs under `setjmp` in `shim.c`, and
+//! the error handler jumps back to that place. The jump crosses only C frames of MuJoCo's engine, never Rust frames or
+//! those of the MJCF compiler, which is C++. The interrupted call leaves `mjData` in an undefined state. So the
+//! [`Simulation`] refuses all further calls, and the caller must make a new one.
 
 mod data;
 mod error;

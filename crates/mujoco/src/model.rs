@@ -12,8 +12,8 @@ use std::{
     sync::{Mutex, OnceLock, PoisonError},
 };
 
-/// Maximal number of files that a model may use. MuJoCo's virtual file system has space for 2000 files, the model's
-/// text included.
+/// Maximal number of files that a model may use. MuJoCo's virtual file system has space for 2000 files, and one of them
+/// is the model's text.
 const MAX_FILES: usize = 1999;
 /// File names must be shorter than this, in bytes. MuJoCo has space for 1000.
 const MAX_FILE_NAME: usize = 900;
@@ -85,9 +85,9 @@ pub struct Model {
     pointer: NonNull<sys::mjModel>,
 }
 
-// SAFETY: mjModel is plain memory without ties to a thread, and `Model` owns it alone.
+// SAFETY: mjModel is plain memory without ties to a thread, and only `Model` owns it.
 unsafe impl Send for Model {}
-// SAFETY: nothing is written through `&Model`: the accessors only read, and mj_copyModel and mj_name2id take const
+// SAFETY: nothing is written through `&Model`. Its methods only read, and mj_copyModel and mj_name2id take const
 // pointers.
 unsafe impl Sync for Model {}
 
@@ -139,12 +139,12 @@ impl Model {
         let name_pointers: Vec<*const c_char> = names.iter().map(|name| name.as_ptr()).collect();
         let data_pointers: Vec<*const c_void> = files.iter().map(|(_, bytes)| bytes.as_ptr().cast()).collect();
         let mut message = [0u8; 1024];
-        // A poisoned mutex is harmless, since it guards no data.
+        // The mutex may be poisoned by a panic in another thread. This is harmless, since the mutex guards no data.
         let _loading = LOADING.lock().unwrap_or_else(PoisonError::into_inner);
-        // SAFETY: `xml`, `message` and the three lists, with what they point to, are valid for the given sizes during
-        // the call, and all but `message` are only read. The names are terminated and fit in the virtual file system,
-        // which also has space for all files. The mutex keeps other threads out of MuJoCo's compiler, and only this
-        // function calls it.
+        // SAFETY: during the call, `xml`, `message`, the three lists and the memory to which they point are valid for
+        // the given sizes. The function writes only to `message`. The names are terminated and fit in the virtual file
+        // system, which also has space for all files. Only this function calls MuJoCo's compiler, and the mutex lets
+        // one thread at a time do it.
         let pointer = unsafe {
             sys::perturb_mj_load(
                 xml.as_ptr().cast::<c_char>(),
@@ -167,7 +167,7 @@ impl Model {
     /// # Errors
     /// [`Error::Fatal`] if there is not enough memory.
     pub fn try_clone(&self) -> Result<Self, Error> {
-        // SAFETY: the pointer is a valid model for the lifetime of `self`; the result is a new one, or null.
+        // SAFETY: the pointer is a valid model for the lifetime of `self`. The function returns a new model or null.
         let pointer = unsafe { sys::perturb_mj_copy_model(self.pointer.as_ptr()) };
         NonNull::new(pointer).map(|pointer| Self { pointer }).ok_or_else(last_error)
     }
@@ -175,7 +175,7 @@ impl Model {
     /// Whether this model and `other` have the same sizes: the number of each kind of element, the length of the names,
     /// and the limits of memory.
     pub fn has_sizes_of(&self, other: &Self) -> bool {
-        // SAFETY: two valid models, only read.
+        // SAFETY: both models are valid, and the function only reads them.
         unsafe { sys::perturb_mj_same_sizes(self.pointer.as_ptr(), other.pointer.as_ptr()) != 0 }
     }
 
@@ -186,7 +186,7 @@ impl Model {
     pub fn id(&self, kind: Kind, name: &str) -> Result<usize, Error> {
         let unknown = || Error::UnknownName { kind: kind.name(), name: name.to_owned() };
         let c_name = CString::new(name).map_err(|_| unknown())?;
-        // SAFETY: a valid model and a terminated string, both only read.
+        // SAFETY: the model is valid, the string is terminated, and the function only reads both.
         let id = unsafe { sys::mj_name2id(self.pointer.as_ptr(), kind.object() as c_int, c_name.as_ptr()) };
         usize::try_from(id).map_err(|_| unknown())
     }
@@ -196,12 +196,13 @@ impl Model {
         if id >= self.count(kind) {
             return None;
         }
-        // SAFETY: a valid model, only read; the result is null or a terminated string of the model.
+        // SAFETY: the model is valid, and the function only reads it. It returns null or a terminated string that
+        // belongs to the model.
         let name = unsafe { sys::mj_id2name(self.pointer.as_ptr(), kind.object() as c_int, id as c_int) };
         if name.is_null() {
             return None;
         }
-        // SAFETY: the string belongs to the model, which lives as long as `self` is borrowed and is not written.
+        // SAFETY: the string belongs to the model, which lives and is not changed as long as `self` is borrowed.
         unsafe { CStr::from_ptr(name) }.to_str().ok().filter(|name| !name.is_empty())
     }
 
@@ -349,9 +350,9 @@ impl Model {
         let [nv, njmax, nconmax, nstack, nu, nbody, n_m, nemax] =
             [m.nv, m.njmax, m.nconmax, m.nstack, m.nu, m.nbody, m.nM, m.nemax].map(|n| n.max(0) as usize);
         let number = size_of::<f64>();
-        // These arrays grow with products of sizes or are large for other reasons: efc_J and its transpose with their
-        // column indices, efc_AR with its column indices, contacts, the stack, actuator moments, and the factors of the
-        // inertia matrix. All other arrays grow linearly with one size.
+        // Adds up the largest arrays of mjData: efc_J and its transpose with their column indices, efc_AR with its
+        // column indices, contacts, the stack, actuator moments, and the factors of the inertia matrix. All other
+        // arrays grow linearly with one size. `linear` is a generous bound for them.
         let jacobian = 2 * njmax.saturating_mul(nv).saturating_mul(number + size_of::<i32>());
         let delassus = njmax.saturating_mul(njmax).saturating_mul(number + size_of::<i32>());
         let contacts = nconmax.saturating_mul(size_of::<sys::mjContact>());
@@ -373,7 +374,7 @@ impl Model {
         let mut arrays = Vec::new();
         for index in 0.. {
             let (mut name, mut elements, mut count, mut size) = (ptr::null(), ptr::null(), 0, 0);
-            // SAFETY: a valid model; the four outputs are written whenever the result is not zero.
+            // SAFETY: the model is valid. The function writes all four outputs whenever its result is not zero.
             let more = unsafe {
                 sys::perturb_mj_array(
                     self.pointer.as_ptr(),
@@ -393,7 +394,7 @@ impl Model {
                 4 => self.array(elements.cast::<f32>().cast_mut(), count).iter().map(|&x| f64::from(x)).collect(),
                 _ => continue,
             };
-            // SAFETY: the name is a string literal of the shim.
+            // SAFETY: the name is a string literal in `shim.c`, so it is terminated and never freed.
             let name = unsafe { CStr::from_ptr::<'static>(name) }.to_str().unwrap_or_default();
             arrays.push(FloatArray { name, values });
         }
@@ -414,20 +415,21 @@ impl Model {
         self.pointer.as_ptr()
     }
 
-    /// Returns an array of this model as a slice. `start` must be an array of this model with `length` elements.
+    /// Returns an array of this model as a slice. `start` must point to the array's first element, and the array must
+    /// have `length` elements.
     fn array<T>(&self, start: *mut T, length: usize) -> &[T] {
         if length == 0 {
             return &[]; // the pointer may be null
         }
-        // SAFETY: the caller passes a field of this model with the length that MuJoCo allocated it with; the sizes
-        // never change, and the memory lives and is not written as long as `self` is borrowed.
+        // SAFETY: the caller passes an array of this model with the length that MuJoCo allocated. Lengths never change.
+        // The memory lives and is not changed as long as `self` is borrowed.
         unsafe { slice::from_raw_parts(start, length) }
     }
 }
 
 impl Drop for Model {
     fn drop(&mut self) {
-        // SAFETY: the pointer came from mj_loadXML or mj_copyModel, is owned by `self`, and is freed once.
+        // SAFETY: the pointer came from mj_loadXML or mj_copyModel, `self` owns it, and it is freed once.
         unsafe { sys::mj_deleteModel(self.pointer.as_ptr()) }
     }
 }
@@ -445,11 +447,11 @@ fn check_library() -> Result<(), Error> {
     static CHECKED: OnceLock<Result<(), Error>> = OnceLock::new();
     CHECKED
         .get_or_init(|| {
-            // SAFETY: takes and touches nothing.
+            // SAFETY: the function has no arguments and only returns a constant.
             let library = unsafe { sys::mj_version() };
             check_version(sys::mjVERSION_HEADER as i32, library)?;
-            // SAFETY: writes one global, once, before any other call: every other call needs a model, which only
-            // `from_xml` makes, after this.
+            // SAFETY: the function writes two global variables, once, before any other thread calls MuJoCo. All other
+            // calls need a model, and models are compiled only after this check.
             unsafe { sys::perturb_mj_silence() };
             Ok(())
         })

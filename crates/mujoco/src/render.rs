@@ -7,8 +7,8 @@ use std::{
     sync::{Mutex, MutexGuard, PoisonError},
 };
 
-/// Minimal number of visual geoms that a scene has space for. A model needs one for each of its geoms, and more for
-/// decorations.
+/// Minimal number of visual geoms that a scene has space for. A picture needs one visual geom for each geom of the
+/// model, and more for decorations.
 const MIN_SCENE_GEOMS: usize = 200;
 /// Maximal number of visual geoms that a scene has space for.
 const MAX_SCENE_GEOMS: usize = 20_000;
@@ -50,8 +50,8 @@ pub struct Renderer {
     size: (u16, u16),
 }
 
-/// Held while MuJoCo uses OpenGL. MuJoCo keeps the addresses of OpenGL's functions in global variables, which are
-/// written whenever a context is created.
+/// A thread holds this mutex while it uses OpenGL through MuJoCo. MuJoCo stores the addresses of OpenGL's functions in
+/// global variables, and writes them whenever it creates a context.
 static DRAWING: Mutex<()> = Mutex::new(());
 
 fn exclusive() -> MutexGuard<'static, ()> {
@@ -78,9 +78,9 @@ impl Renderer {
         };
         let mut simulation = Simulation::new(model)?;
         simulation.kinematics()?;
-        // From here on `drop` frees all parts. Freeing the defaults is allowed, too.
+        // From here on `drop` frees scene and context. It may also free them while they are empty defaults.
         let mut renderer = Self { gl, simulation, option, scene, context, size: (0, 0) };
-        // SAFETY: a valid model and a default scene.
+        // SAFETY: the model is valid, and the scene is an empty default.
         check(unsafe {
             sys::perturb_mjv_make_scene(
                 renderer.simulation.model().as_ptr(),
@@ -133,7 +133,7 @@ impl Renderer {
                 }
             }
         };
-        // SAFETY: model, data and scene belong together and are valid; `&mut self` excludes other users.
+        // SAFETY: model, data and scene belong together and are valid. `&mut self` excludes other users of them.
         check(unsafe {
             sys::perturb_mjv_update_scene(
                 self.simulation.model().as_ptr(),
@@ -146,7 +146,7 @@ impl Renderer {
         let row = 3 * usize::from(width);
         let mut pixels = vec![0; row * usize::from(height)];
         let _drawing = self.enter()?;
-        // SAFETY: the context was made in `gl`, which is current; `pixels` has the size of the picture, and the
+        // SAFETY: the context was made in `gl`, which is current. `pixels` has the size of the picture, and the
         // context's buffer is at least as large.
         check(unsafe {
             sys::perturb_mjr_draw(
@@ -169,7 +169,8 @@ impl Renderer {
     fn make_room(&mut self, size: (u16, u16)) -> Result<(), Error> {
         let _drawing = self.enter()?;
         // SAFETY: `gl` is current. The context is an empty default or was made in `gl`, and freeing makes it an empty
-        // default again. Making one writes the size into the model, of which `&mut self` excludes other users.
+        // default again. Making a context writes the buffer's size into the model, of which `&mut self` excludes other
+        // users.
         unsafe {
             if mem::take(&mut self.size) != (0, 0) {
                 check(sys::perturb_mjr_free_context(&raw mut *self.context))?;
@@ -194,8 +195,8 @@ impl Renderer {
 impl Drop for Renderer {
     fn drop(&mut self) {
         let drawing = self.enter();
-        // SAFETY: the context was made in `gl`, which is current, and the scene was made for the model; both are freed
-        // once. A context that is incomplete, or whose `gl` cannot be made current, is freed by the driver when `gl` is
+        // SAFETY: the context was made in `gl`, which is current, and the scene was made for the model. Both are freed
+        // once. If the context is incomplete or `gl` cannot be made current, the driver frees the context when `gl` is
         // dropped.
         unsafe {
             if drawing.is_ok() && self.size != (0, 0) {

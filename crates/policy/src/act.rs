@@ -120,9 +120,9 @@ impl Actor {
     }
 
     /// Makes the actor of a feed-forward policy cache the activations of its networks, for
-    /// [`Differentiator::load_from`](crate::Differentiator::load_from). The cache must hold the observations of
-    /// `n_steps` steps and of one more batch, whose values are computed afterwards. If these are more than 64
-    /// observations, this call has no effect.
+    /// [`Differentiator::load_from`](crate::Differentiator::load_from). The cache needs one row for each observation of
+    /// `n_steps` steps, and for each observation of one more batch whose values are computed afterwards. If these are
+    /// more than 64 rows, this call has no effect.
     pub fn keep_activations(&mut self, n_steps: usize) {
         match &mut self.network {
             Network::FeedForward(network) if self.max_batch.saturating_mul(n_steps.saturating_add(1)) <= BLOCK => {
@@ -253,7 +253,8 @@ impl Actor {
     }
 }
 
-/// Replaces `out` by the first element of each of the first `n` rows.
+/// Replaces `out` by the first element of each of the first `n` rows: the values V, because a value network has one
+/// output.
 fn replace_by_first_column(out: &mut Vec<f32>, rows: RowsFrom<'_>, n: usize) {
     out.clear();
     out.extend((0..n).map(|n| rows.row(n)[0]));

@@ -81,8 +81,8 @@ impl FeedForward {
         FeedForward { observation_size: spec.observation_size, networks, activations, max_cached: 0, cached: None }
     }
 
-    /// Turns on the cache of activations, for [`FeedForward::exchange`]. It holds up to [`BLOCK`] rows. Observations
-    /// for which only values are computed use rows too.
+    /// Turns on the cache of activations, for [`FeedForward::exchange`]. It holds up to [`BLOCK`] rows. Each
+    /// observation takes one row, even if only its value is computed.
     pub(crate) fn keep(&mut self, spec: &PolicySpec) {
         self.max_cached = BLOCK;
         self.activations = Activations::new(spec, &self.networks, BLOCK);

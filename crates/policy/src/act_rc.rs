@@ -139,7 +139,8 @@ impl Kernel for RecurrentStep<'_> {
         let inputs = &network.observations;
         let outputs = &mut network.hidden_layers[..];
         call(simd, Forward { network: &network.hidden, inputs, rows: 0..n, outputs });
-        // The LSTM's inputs: x from the hidden layers. The previous outputs h are already in place.
+        // Copies x from the last hidden layer into the LSTM's inputs. The inputs already contain the previous outputs
+        // h.
         let x = network.hidden_layers.last().unwrap_or(&network.observations);
         for row in 0..n {
             network.inputs.row_mut(row)[..network.hidden_size].copy_from_slice(&x.row(row)[..network.hidden_size]);

@@ -176,12 +176,12 @@ impl Differentiator {
         let gaussian = &*gaussian;
         let n = indices.len();
         let size = n.div_ceil(n_parts);
-        // Differentiates part number `place`. The first part writes to the caller's gradient, the others to their own
-        // buffers.
-        let work = |place: usize, part: &mut MinibatchPart, gradient: Option<&mut [f32]>| {
+        // Computes the gradient of the part with index `part_index`. The first part writes to the caller's gradient,
+        // all others to their own buffers.
+        let work = |part_index: usize, part: &mut MinibatchPart, gradient: Option<&mut [f32]>| {
             let MinibatchPart { block, gradient: own, losses } = part;
             let sums = gradient.unwrap_or(own);
-            let first = place * size;
+            let first = part_index * size;
             let indices = &indices[first..n.min(first + size)];
             let context =
                 MinibatchContext { spec, networks, gaussian, weights, samples, is_computed, objective, mean, scale, n };
@@ -189,7 +189,7 @@ impl Differentiator {
         };
         let parts = &mut parts[..n.div_ceil(size)];
         match threads {
-            // Each thread gets at least two parts, because waking a thread takes about as long as computing a part.
+            // Each thread gets at least two parts: waking a thread takes about as long as computing one part.
             Some(pool) if parts.len() > 2 => {
                 let share = parts.len().div_ceil(pool.current_num_threads() + 1).max(2);
                 pool.in_place_scope(|scope| {
@@ -211,9 +211,9 @@ impl Differentiator {
         }
         // Adds the parts in order, so that the sum does not depend on which thread finished first.
         let mut losses = Losses::default();
-        for (place, part) in parts.iter().enumerate() {
+        for (part_index, part) in parts.iter().enumerate() {
             losses += part.losses;
-            if place > 0 {
+            if part_index > 0 {
                 run(Add { sums: gradient, more: &part.gradient });
             }
         }

@@ -25,7 +25,8 @@ impl<K: Kernel> WithSimd for Compiled<K> {
 
     #[inline(always)]
     fn with_simd<S: Simd>(self, simd: S) {
-        // Without wider vectors, uses vectors of four numbers: every x86-64 processor has them.
+        // On a processor without wide vectors, pulp would compute single numbers. Vectors of four numbers are faster,
+        // and every x86-64 processor has them.
         if S::F32_LANES == 1 { self.0.run(Scalar128b) } else { self.0.run(simd) }
     }
 }

@@ -78,7 +78,8 @@ impl RunningMoments {
         self.squares[i] += squares + delta * delta * a * b / (a + b);
     }
 
-    /// Checks that these are possible moments of vectors of `size` numbers. The error is a description of the fault.
+    /// Checks saved moments of vectors of `size` numbers: lengths must match, numbers be finite, and sums of squares
+    /// not negative. The error describes the fault.
     fn check(&self, size: usize) -> std::result::Result<(), String> {
         for (name, numbers) in [("mean", &self.mean), ("squares", &self.squares)] {
             if numbers.len() != size {
@@ -162,8 +163,8 @@ impl ObservationNormaliser {
         &self.moments
     }
 
-    /// Checks that this normalises observations of `observation_size` numbers except the last `left_alone`. The error
-    /// is a description of the fault.
+    /// Checks that this normaliser is for observations of `observation_size` numbers and leaves the last `left_alone`
+    /// unchanged. Also checks that its statistics are valid. The error describes the fault.
     pub fn check(&self, observation_size: usize, left_alone: usize) -> std::result::Result<(), String> {
         if self.left_alone != left_alone {
             return Err(format!("left_alone is {}, expected {left_alone}", self.left_alone));
@@ -286,7 +287,8 @@ impl RewardNormaliser {
         Ok(())
     }
 
-    /// Checks that the saved numbers are possible. The error is a description of the fault.
+    /// Checks saved numbers: γ must be in 0 … 1, the returns finite, and the statistics valid. The error describes the
+    /// fault.
     pub fn check(&self) -> std::result::Result<(), String> {
         if !(0.0..=1.0).contains(&self.gamma) {
             return Err(format!("gamma is {}, but must be between 0 and 1", self.gamma));

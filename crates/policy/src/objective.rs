@@ -210,7 +210,8 @@ impl Objective {
         let moved = value - sample.old_value;
         let error = sample.old_value + moved.clamp(-range as f32, range as f32) - sample.return_;
         let clipped = error * error;
-        // Without clipping, the two losses are equal up to rounding; the derivative is then that of `free`.
+        // If V moved by at most `range`, it is not clipped, and both losses are equal up to rounding. The derivative is
+        // then that of `free`.
         if free.0 >= clipped || moved.abs() <= range as f32 { free } else { (clipped, 0.0) }
     }
 
@@ -228,7 +229,8 @@ impl Objective {
         let clipped = -sample.advantage * ratio.clamp((1.0 - range) as f32, (1.0 + range) as f32);
         losses.approx_kl = f64::from(ratio - 1.0 - log_ratio);
         losses.clip_fraction = f64::from(u8::from((ratio - 1.0).abs() > range as f32));
-        // Without clipping, the two losses are equal. NaN compares as false, so a NaN loss is passed on.
+        // If the ratio is within 1 ± `range`, both losses are equal. Comparisons with NaN are false, so a NaN in `free`
+        // is passed on.
         let (loss, derivative) = if clipped > free { (clipped, 0.0) } else { (free, free) };
         losses.policy = f64::from(loss);
         derivative

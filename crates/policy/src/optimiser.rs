@@ -6,7 +6,8 @@ use crate::error::{Error, Result, check_length};
 use crate::kernel::{Kernel, run};
 use crate::weights::{NamedArray, check_arrays};
 
-/// Number of partial sums into which the sum of squares is split. It fixes the order of additions, and so the rounding.
+/// Number of partial sums in which the squares of a gradient's elements are added. It fixes the order of additions, and
+/// so the rounding.
 const SUMS: usize = 8;
 
 /// The rule that turns a gradient into a change of the weights.

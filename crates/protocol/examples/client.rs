@@ -1,5 +1,6 @@
 //! Plays the scenarios of the C++ and Go clients in `examples/clients` with the Rust client. `client ADDRESS SCENARIO
-//! FILE` writes every reply to a file, as a `SessionResponse` message. The other clients must write the same bytes.
+//! FILE` writes every reply to a file, as a `SessionResponse` message. The C++ and Go clients must write the same
+//! bytes.
 
 use std::error::Error;
 use std::{env, fs};
@@ -26,8 +27,8 @@ impl Session {
         Ok((session, opened))
     }
 
-    /// Sends a request and returns its reply. `number` is the request's field number in `SessionRequest`, which is also
-    /// the reply's in `SessionResponse`.
+    /// Sends a request and returns its reply. `number` is the request's field number in `SessionRequest`. The reply has
+    /// the same field number in `SessionResponse`.
     async fn ask<A>(&mut self, number: u32, request: A) -> Result<A::Reply, ClientError>
     where
         A: TypedRequest,

@@ -37,8 +37,9 @@ impl AdaptiveSpin {
         self.backs_off = true;
     }
 
-    /// Waits for `event`, and returns its output. While it spins, it yields repeatedly: first to the other async tasks
-    /// of the thread, because one of them may have to send the request, then to other threads.
+    /// Waits for `event`, and returns its output. A spinning wait yields repeatedly, first to the other async tasks of
+    /// the thread, then to other threads. It must yield to tasks, because the task that sends the request may run in
+    /// the same thread.
     pub async fn until<F: Future>(&mut self, event: F) -> F::Output {
         let begun = Instant::now();
         let mut event = pin!(event);
@@ -82,7 +83,8 @@ mod tests {
     use std::sync::Arc;
     use std::task::Poll;
 
-    /// Serialises tests whose timing suffers from the busy threads of `spin_backs_off_when_contended`.
+    /// Makes tests run one after the other, because the busy threads of `spin_backs_off_when_contended` change the
+    /// timing of other tests.
     static ALONE: tokio::sync::Mutex<()> = tokio::sync::Mutex::const_new(());
 
     /// Waits for an event that occurs after `time`. Returns how often it was polled.

@@ -32,9 +32,9 @@ pub enum Address {
      `tcp://host:port`, with TLS `https://host:port`"
 )]
 pub struct AddressError {
-    /// The text.
+    /// The text that is not an address.
     pub text: String,
-    /// The reason why it is not an address.
+    /// The reason why the text is not an address.
     pub reason: String,
 }
 
@@ -151,7 +151,8 @@ fn parse_tcp(text: &str, tls: bool) -> Result<Address, String> {
 mod tests {
     use super::*;
 
-    /// The Python package has a parser of its own, whose tests read the same table of accepted and refused addresses.
+    /// The tests of the Python package read the same table of accepted and refused addresses, because Python has a
+    /// separate parser.
     #[test]
     fn addresses_are_understood_as_in_python() {
         let table: serde_json::Value = serde_json::from_str(include_str!("../tests/addresses.json")).unwrap();

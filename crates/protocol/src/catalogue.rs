@@ -40,8 +40,8 @@ impl Environment {
         self.parameters.iter().chain(&self.disturbances).find(|parameter| parameter.name == name)
     }
 
-    /// Returns the environment of a session whose request names the parameters `names`. If one of them is a
-    /// disturbance, the environment has [all disturbances](Self::disturbed) as parameters.
+    /// Returns this environment as it is in a session that was opened with values for the parameters `names`. If one of
+    /// the names is a disturbance, [all disturbances](Self::disturbed) are appended to the environment's parameters.
     pub fn with_parameters<'a>(&self, names: impl IntoIterator<Item = &'a str>) -> Cow<'_, Self> {
         let is_own = |name: &str| self.parameters.iter().any(|parameter| parameter.name == name);
         let is_disturbance = |name: &str| self.disturbances.iter().any(|disturbance| disturbance.name == name);
@@ -49,8 +49,8 @@ impl Environment {
         if names_one { Cow::Owned(self.disturbed()) } else { Cow::Borrowed(self) }
     }
 
-    /// Returns the environment with all disturbances appended to its parameters. A session that names a disturbance has
-    /// this environment.
+    /// Returns this environment with all disturbances appended to its parameters. Sessions whose requests name a
+    /// disturbance use this form.
     #[must_use]
     pub fn disturbed(&self) -> Self {
         let mut disturbed = self.clone();
@@ -66,7 +66,8 @@ impl Environment {
         disturbed
     }
 
-    /// Returns the environment of a session. If `parameters` is true, its observations end with the parameters' values.
+    /// Returns this environment as it is in a session. If `parameters` is true, the values of the parameters are
+    /// appended to its observations.
     #[must_use]
     pub fn observed(&self, parameters: bool) -> Self {
         let mut session = self.clone();

@@ -275,8 +275,8 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
     Ok(if found.len() > 1 { sorted(found, tls.as_deref()) } else { one() })
 }
 
-/// Resolves a host name in a new thread, so that a resolver that hangs blocks nothing else. It is an error if no thread
-/// can be started; tokio's own resolver would panic.
+/// Resolves a host name in a new thread, so that a resolver that hangs blocks nothing else. Returns an error if no
+/// thread can be started; tokio's own resolver would panic.
 async fn look_up(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     let name = host.to_owned();
     let (sender, found) = tokio::sync::oneshot::channel();
@@ -359,9 +359,10 @@ async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), Clie
         Ok(ServingStatus::NotServing) => Err(refuse("it is shutting down".into())),
         Ok(_) => Ok(()),
         Err(status) => match status.code() {
-            // A proxy in between may refuse all calls but perturb's own.
+            // The health check was refused. The server may still accept sessions, because a proxy may pass on only
+            // perturb's own calls.
             Code::NotFound | Code::PermissionDenied | Code::Unauthenticated | Code::Unimplemented => Ok(()),
-            // The answer is not even a gRPC status.
+            // An error with a source was created by the client, because the answer is not gRPC.
             _ if std::error::Error::source(&status).is_some() => {
                 Err(ClientError::NotPerturb { address: address.clone() })
             }

@@ -21,8 +21,8 @@ pub const CERT: &str = "PERTURB_CERT";
 pub const KEY: &str = "PERTURB_KEY";
 /// Environment variable that, if set to 1, lets a client send its token unencrypted to other machines.
 pub const INSECURE: &str = "PERTURB_INSECURE";
-/// PEM files of the authorities that an operating system trusts. Debian and Alpine have the first, Red Hat the second,
-/// SUSE the third.
+/// Paths of the PEM file of the authorities that an operating system trusts: on Debian and Alpine, on Red Hat, and on
+/// SUSE.
 const SYSTEM_CA: [&str; 3] =
     ["/etc/ssl/certs/ca-certificates.crt", "/etc/pki/tls/certs/ca-bundle.crt", "/etc/ssl/ca-bundle.pem"];
 
@@ -64,7 +64,7 @@ impl Default for Trust {
 }
 
 impl Credentials {
-    /// Reads the credentials for a server at this address, as the process's environment variables say.
+    /// Reads the credentials for a server at this address. The process's environment variables name the files.
     ///
     /// # Errors
     /// The errors of [`Credentials::from_variables`].

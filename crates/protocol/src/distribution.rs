@@ -106,7 +106,8 @@ impl Distribution {
             }
             rest -= interval.length();
         }
-        // A fixed value, or u is so close to 1 that rounding exceeded the total length.
+        // The loop returns nothing for a fixed value, whose length is 0. It also returns nothing if `u` is so close to
+        // 1 that rounding exceeds the total length.
         self.0[self.0.len() - 1].high
     }
 
@@ -114,13 +115,13 @@ impl Distribution {
     /// likely. Returns `None` if the intervals contain no whole number.
     pub fn whole_number_at(&self, u: f64) -> Option<f64> {
         // Adjacent intervals may share an end. A shared whole number counts only once.
-        let numbers = |place: usize| {
-            let Interval { low, high } = self.0[place];
-            let is_shared = place > 0 && self.0[place - 1].high == low && low.fract() == 0.0;
+        let numbers = |i: usize| {
+            let Interval { low, high } = self.0[i];
+            let is_shared = i > 0 && self.0[i - 1].high == low && low.fract() == 0.0;
             let first = low.ceil() + f64::from(u8::from(is_shared));
             (first, (high.floor() - first + 1.0).max(0.0))
         };
-        let mut rest = (u * (0..self.0.len()).map(|place| numbers(place).1).sum::<f64>()).floor();
+        let mut rest = (u * (0..self.0.len()).map(|i| numbers(i).1).sum::<f64>()).floor();
         for (first, count) in (0..self.0.len()).map(numbers) {
             if rest < count {
                 return Some(first + rest);

@@ -44,7 +44,8 @@ pub(crate) struct Connector {
     failure: TlsFailure,
 }
 
-/// The reason why the last connection was not trusted by one of its sides; `None` if there is no such reason.
+/// The reason why client or server did not trust the other side of the last connection. `None` if there was no problem
+/// of trust.
 type TlsFailure = Arc<Mutex<Option<String>>>;
 
 impl Connector {
@@ -84,8 +85,8 @@ impl Connector {
         Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })
     }
 
-    /// Returns why the client did not trust the server's certificate, or the server the client's. `None` if the
-    /// connection did not fail for such a reason.
+    /// Returns why one side of the last connection, client or server, did not trust the other side's certificate.
+    /// `None` if there was no such problem.
     pub(crate) fn failure(&self) -> Option<String> {
         self.failure.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }

@@ -190,7 +190,7 @@ fn when(request: &str) -> String {
 /// terminals.
 pub(crate) fn describe(status: &Status) -> String {
     match std::error::Error::source(status) {
-        // The transport's own messages are about HTTP/2 frames and streams, which do not help users.
+        // The transport's messages are about HTTP/2 frames and streams. They do not help users, so they are not shown.
         Some(cause) => system_words(cause).unwrap_or_else(|| "the connection broke off".into()),
         None if status.message().is_empty() => format!("{:?}", status.code()),
         None => escape_lines(status.message()),

@@ -1,8 +1,9 @@
-//! The ledger of a server: a tamper-evident log of the parameter regions from which the holders of its tokens drew.
+//! The ledger of a server: a tamper-evident log of the regions of the parameter space from which the server's sessions
+//! drew.
 //!
 //! Each line is a digest, a space, and a [`LedgerEntry`] as JSON. The digest is the SHA-256, in hexadecimal, of the
 //! previous line's digest (64 zeros for the first line), a space, and the JSON. So changing, removing or inserting a
-//! line changes all later digests. Knowing the digest of one line is enough to verify all lines up to it.
+//! line changes all later digests. The digest of one line is enough to verify all lines up to that line.
 
 use std::io::{self, BufRead, BufReader, Read as _};
 use std::path::{Path, PathBuf};

@@ -100,8 +100,8 @@ impl PrivateServer {
     }
 
     /// Sets a function that receives each line that private servers write to standard error. It applies to servers that
-    /// are started later. Without a handler, servers write to this process's standard error directly, between its own
-    /// output. Only the first call has an effect.
+    /// are started later. Without a handler, servers write directly to this process's standard error, mixed with the
+    /// process's own lines. Only the first call has an effect.
     pub fn set_stderr_handler(handler: fn(String)) {
         let _ = STDERR_HANDLER.set(handler);
     }
@@ -181,7 +181,8 @@ impl Process {
         // An error means that the process has ended already.
         let _ = self.child.kill();
         let _ = self.child.wait();
-        // The wait is limited, because a child of the server may still hold its standard error open.
+        // The time to wait is limited, because a child process of the server may still hold the server's standard error
+        // open.
         self.stderr_done.take().map(|done| done.recv_timeout(STDERR_TIMEOUT));
     }
 }
@@ -224,7 +225,8 @@ fn spawn(
         .process_group(0)
         .spawn()
         .map_err(|error| fail(spawn_failure(&error)))?;
-    // Standard error goes to the handler, if there is one. Standard output tells when the server listens.
+    // Passes the server's standard error to the handler, if there is one. Its standard output is read below, since it
+    // reports when the server listens.
     let (sender, stderr_done) = channel();
     let stderr = STDERR_HANDLER.get().zip(child.stderr.take());
     let forwarded = stderr.map(|(handler, stderr)| {
@@ -244,7 +246,7 @@ fn spawn(
     match ready {
         Ok(()) => Ok(process),
         Err(not_ready) => {
-            // The exit status distinguishes a refused task folder from other failures.
+            // The server reports a refused task folder by its exit status.
             let is_refusal = process.exit_code() == Some(REFUSED_STATUS) && !tasks.is_empty();
             process.kill();
             Err(match not_ready {

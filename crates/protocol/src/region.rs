@@ -111,9 +111,9 @@ impl Region {
     }
 }
 
-/// Whether `holds` is true for the two boxes' sets of every parameter. False if a parameter that is not a disturbance
-/// is in only one of the boxes. `lacking` gives the value of a disturbance in a box without it. If it gives `None`, the
-/// disturbance is ignored.
+/// Compares two boxes: whether `holds` is true for every parameter, given the parameter's set of values in each box.
+/// Returns false if a parameter that is not a disturbance is in only one box. If a disturbance is in only one box,
+/// `lacking` returns its value in the other box, or `None` to ignore the disturbance.
 fn pairs(
     one: &ParameterBox,
     other: &ParameterBox,

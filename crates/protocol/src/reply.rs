@@ -114,15 +114,16 @@ const EXPONENT: u32 = 0x7f80_0000;
 fn first_not_finite(bytes: &[u8]) -> Option<usize> {
     let words = bytes.as_chunks::<4>().0;
     let wrong = |word: &[u8; 4]| u32::from_le_bytes(*word) & EXPONENT == EXPONENT;
-    // A pass without branches comes first, because nearly always all numbers are finite.
+    // First checks all numbers in a fast loop without branches. The slower search for an index is rarely needed,
+    // because nearly all arrays are finite.
     if !words.iter().fold(false, |found, word| found | wrong(word)) {
         return None;
     }
     words.iter().position(wrong)
 }
 
-fn number(bytes: &[u8], place: usize) -> f32 {
-    bytes.as_chunks::<4>().0.get(place).map_or(f32::NAN, |word| f32::from_le_bytes(*word))
+fn number(bytes: &[u8], index: usize) -> f32 {
+    bytes.as_chunks::<4>().0.get(index).map_or(f32::NAN, |word| f32::from_le_bytes(*word))
 }
 
 #[cfg(test)]

@@ -112,10 +112,12 @@ struct RawStream {
 }
 
 impl RawStream {
-    /// Starts a stream with its first request. The channel of requests has space for `room` requests more than usual.
-    /// The first request is queued before the call starts, because a server may wait for it before it accepts the call.
+    /// Starts a stream with its first request. The channel of requests has space for [`QUEUE_LENGTH`] + `room`
+    /// requests. The first request is queued before the call starts, because a server may wait for that request before
+    /// it accepts the call.
     ///
-    /// The inner error is the status with which the server refused the call.
+    /// The outer error means that the server did not answer in time. The inner error is the status with which the
+    /// server refused the call.
     async fn begin(
         connection: &Connection,
         first: impl Into<Request>,
@@ -178,7 +180,7 @@ impl Stream {
             let _ = self.raw.requests.send(message).await;
             return Ok(());
         }
-        // The channel is closed only after the stream has ended.
+        // Sending fails only if the channel is closed, which happens only after the stream has ended.
         let ended = |_| lost(self.connection.address(), A::NAME, &Status::unavailable("the stream has ended"));
         self.raw.requests.send(message).await.map_err(ended)
     }
@@ -285,9 +287,9 @@ impl Stream {
                 }
                 Err(status) => status,
             };
-            // Only a session with a lease whose connection failed can be resumed, and not too often without a reply.
             let error = lost(self.connection.address(), A::NAME, &status);
-            // Only a failure of the connection can be resumed, not a status that the server sent.
+            // Resumes a session that has a lease and lost its connection, unless the server itself ended the stream
+            // with a status. The number of resumptions without a reply in between is limited.
             let Some(lease) = self
                 .lease
                 .as_mut()

@@ -232,9 +232,9 @@ fn finite(parameter: &str, text: &str, points: Vec<f64>) -> Result<Vec<f64>, Val
     Ok(points)
 }
 
-/// Makes a set called `name` of the parameters in `assignments`; other parameters follow `version`. If a parameter has
-/// points, the set is the grid of all combinations, and the first parameter varies fastest. Each of the grid's
-/// parameters must then have points or a single value.
+/// Makes a set called `name` of the parameters in `assignments`. All other parameters have the distributions of
+/// `version`. If a parameter has points, the set is the grid of all combinations, and the first parameter varies
+/// fastest. Each of the grid's parameters must then have points or a single value.
 ///
 /// # Errors
 /// [`ValueError`] if a parameter occurs twice, a grid contains a parameter that is drawn, or there are more contexts
@@ -263,7 +263,7 @@ pub fn set_of(name: &str, version: Version, assignments: Vec<Assignment>) -> Res
         let count = contexts.len().saturating_mul(points.len());
         let expected = format!("a grid of at most {MAX_CONTEXTS} points");
         require(count <= MAX_CONTEXTS, name, format!("{count} points"), expected)?;
-        // Copies all contexts so far for each point of this parameter.
+        // Copies every context so far once for each point of this parameter.
         let with = |point: &f64| {
             let add = |context: &Context| {
                 let mut context = context.clone();

@@ -1,4 +1,5 @@
-//! A session without environments. It counts its steps. The action of a step is a number that the client chooses.
+//! A session without environments, which counts its steps. The client sends a number of its choice as the action of
+//! each step.
 
 use bytes::Bytes;
 use perturb::proto::{self, session_request::Request, session_response::Response};
@@ -34,7 +35,7 @@ impl CountingSession {
         Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })
     }
 
-    /// Records a step. The reply has the number in the request, and the number of steps so far.
+    /// Records a step. The reply contains the number from the request, and the number of steps so far.
     fn step(&mut self, step: &proto::Step) -> Result<CountingReply, Error> {
         let number = step.actions[..].try_into().map(u64::from_le_bytes);
         let number = number.map_err(|_| Error::value("step.actions", step.actions.len(), "8 bytes"))?;

@@ -52,7 +52,7 @@ const MAX_BYTES: usize = 1 << 20;
 /// A record of the steps that the server took, with counters of its sessions. Clones share the same data.
 #[derive(Clone)]
 pub struct StepLog {
-    /// The number in each step request, in the order in which the server took the steps.
+    /// The numbers that clients sent as actions, one for each step, in the order in which the server took the steps.
     done: Arc<Mutex<Vec<u64>>>,
     numbers: LeaseCounters,
     limiter: PeerLimiter,
@@ -67,7 +67,8 @@ impl Default for StepLog {
 }
 
 impl StepLog {
-    /// Returns the number in each step request, in the order in which the server took the steps.
+    /// Returns the numbers that clients sent as actions, one for each step, in the order in which the server took the
+    /// steps.
     pub fn done(&self) -> Vec<u64> {
         self.done.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
@@ -82,7 +83,7 @@ impl StepLog {
         self.counters.counts().filter(|(kind, _)| *kind == ErrorKind::UnknownLease).map(|(_, count)| count).sum()
     }
 
-    /// Whether the server has no sessions, connected or waiting to be resumed.
+    /// Whether the server has no sessions at all: neither connected sessions, nor sessions that wait to be resumed.
     pub fn is_idle(&self) -> bool {
         self.limiter.in_use() == 0 && self.numbers.detached() == 0
     }

@@ -2,7 +2,7 @@
 //!
 //! - [`plain`]: opens and reads plain files. Pipes and devices are refused without waiting.
 //! - [`signals`]: makes a write beyond the limit of file sizes fail, instead of ending the program.
-//! - [`support`]: works without operations that a file system does not support.
+//! - [`support`]: skips operations that a file system does not support, and logs the consequence.
 //! - [`threads`]: explains why a thread cannot be started.
 //! - [`terminal`]: removes control characters from untrusted text.
 #![forbid(unsafe_code)]

@@ -55,7 +55,7 @@ impl Operation {
 /// locks.
 ///
 /// # Errors
-/// The operating system's.
+/// The operating system's error.
 pub fn is_taken(lock: std::result::Result<(), TryLockError>, path: &Path) -> Result<Option<bool>> {
     let taken = match lock {
         Ok(()) => Ok(true),

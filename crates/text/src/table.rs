@@ -9,7 +9,7 @@ use comfy_table::{CellAlignment, TableStyle};
 /// A table to be displayed or written to a file.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Table {
-    /// The title, or the name of the file to write.
+    /// The title, which may serve as the name of the table's file.
     pub title: String,
     /// The columns, from left to right.
     pub columns: Vec<Column>,
@@ -33,7 +33,7 @@ pub struct Column {
 pub struct Entry {
     /// The displayed text.
     pub text: String,
-    /// A percentage that may be shown by the background colour.
+    /// A percentage that may be shown as a background colour.
     pub heat: Option<f64>,
 }
 
@@ -61,8 +61,8 @@ impl Table {
         self.drawn(NOTHING, str::to_owned).trim_fmt()
     }
 
-    /// Renders the table as text for a terminal that is `width` characters wide. Columns that do not fit follow below,
-    /// where the text columns on the left are repeated.
+    /// Renders the table as text for a terminal that is `width` characters wide. If not all columns fit, the table is
+    /// divided into several blocks, one below the other. Every block starts with the leftmost columns of texts.
     pub fn to_text_within(&self, width: usize) -> String {
         let keys = self.columns.iter().take_while(|column| !column.is_number).count();
         let fits = |text: &str| text.lines().all(|line| line.chars().count() <= width);
@@ -82,8 +82,9 @@ impl Table {
         blocks.join("\n\n")
     }
 
-    /// Returns whether the table may be broken before column number `place`. A break at the end is always possible. A
-    /// column that shares its name with another column must stay with the columns before it.
+    /// Returns whether a new block may begin with the column at index `place`. The index after the last column is
+    /// always allowed. A column that has the same name as another column must stay in the block of the column before
+    /// it.
     fn may_begin(&self, place: usize) -> bool {
         let Some(column) = self.columns.get(place) else { return true };
         self.columns.iter().filter(|other| other.name == column.name).count() == 1
@@ -142,7 +143,8 @@ impl<'r, R> TableBuilder<'r, R> {
         self.push_column(column, &|source| entry(source).into())
     }
 
-    /// Adds a column. Because `entry` is a dynamic call, this code is compiled only once for each type of row.
+    /// Adds a column. `entry` is a trait object, so that this code is compiled once for each type of row and not for
+    /// each closure.
     fn push_column(mut self, column: Column, entry: &dyn Fn(&'r R) -> Entry) -> Self {
         self.table.columns.push(column);
         for (row, source) in self.table.rows.iter_mut().zip(self.sources) {

@@ -7,7 +7,7 @@ use super::loss::LossTargets;
 use super::{Distributions, Sequences, TorchPolicy};
 use crate::error::{Error, Result};
 
-/// A rollout or a minibatch: M sequences of L steps. Without padding it has V samples.
+/// A rollout or a minibatch: M sequences of L steps. V of these L·M steps are samples, the others are padding.
 pub(crate) struct TensorBatch {
     /// The observations and the memory on which the policy is evaluated.
     pub(crate) sequences: Sequences,

@@ -51,8 +51,8 @@ pub fn evaluate(objective: &Objective, evaluated: &Evaluated, targets: &LossTarg
     Ok((total, Losses { policy, value, entropy, total: sum, approx_kl, clip_fraction, kl_divergence }))
 }
 
-/// Returns PPO's clipped surrogate, the approximate KL divergence and the share of clipped samples. Only the first is
-/// differentiable.
+/// Returns PPO's clipped surrogate, the approximate KL divergence and the share of clipped samples. Only the surrogate
+/// is differentiable.
 fn clipped_surrogate(log_probs: &Tensor, targets: &LossTargets, advantages: &Tensor, range: f64) -> [Tensor; 3] {
     let log_ratio = log_probs - &targets.old_log_probs;
     let ratio = log_ratio.exp();
@@ -112,7 +112,8 @@ mod tests {
 
     #[test]
     fn the_surrogate_has_no_gradient_where_moving_on_would_gain() {
-        // The ratios are 1.5 and 0.5. The first is clipped if the advantage is positive, the second if it is negative.
+        // The ratios are 1.5 and 0.5. The ratio 1.5 is clipped if the advantage is positive, the ratio 0.5 if it is
+        // negative.
         let advantages = Tensor::of_slice(&[1.0f32, -1.0, 1.0, -1.0]);
         let targets = LossTargets { old_log_probs: Tensor::of_slice(&[0.0f32; 4]), ..targets() };
         let log_probs = [1.5f32.ln(), 1.5f32.ln(), 0.5f32.ln(), 0.5f32.ln()];

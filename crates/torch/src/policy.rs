@@ -42,7 +42,7 @@ impl TorchPolicy {
     /// Creates a policy with the given weights `[P]`.
     ///
     /// Sets libtorch to one thread in the whole process. These networks are too small to gain from several threads, and
-    /// sums keep a fixed order.
+    /// with one thread sums have a fixed order.
     ///
     /// # Errors
     /// An error if the number of weights is wrong.

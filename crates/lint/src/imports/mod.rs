@@ -6,13 +6,13 @@ mod scan;
 
 use std::collections::{BTreeMap, BTreeSet};
 
-/// Maximum length of a chain of re-exports that is followed.
+/// Maximum number of re-exports that are followed to find the definition of an item.
 const MAX_REEXPORTS: usize = 16;
 
 /// The path of a module: its names from the crate's root downwards. The root's path is empty.
 pub type ModulePath = Vec<String>;
 
-/// An import: a place in one module where another module of the same package is named.
+/// An import: a line in one module that names another module of the same package, or an item in it.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Import {
     /// The module that contains the import.
@@ -53,7 +53,7 @@ struct WrittenPath {
 /// A name that a `use` or an `import` defines in a module.
 #[derive(Clone, Debug)]
 struct Binding {
-    /// The name, or `None` for all public names of the target: `use target::*`.
+    /// The name; `None` in `use target::*`, which imports all public names of the target.
     name: Option<String>,
     target: Vec<String>,
 }
@@ -74,7 +74,7 @@ impl ResolvedPath {
     }
 }
 
-/// The modules of a package, with their imports before paths are resolved.
+/// The modules of a package, with the paths in them before they are resolved.
 #[derive(Debug, Default)]
 struct Modules {
     modules: BTreeSet<ModulePath>,
@@ -106,8 +106,8 @@ impl Modules {
         imports.into_iter().map(|(_, _, import)| import).collect()
     }
 
-    /// Resolves the path `names` as seen from `module`: returns the module, or the item with the module that defines
-    /// it. Returns `None` if the path leads out of the package.
+    /// Resolves the path `names` that is written in `module`. Returns `None` if the path leads out of the package, or
+    /// after too many re-exports. `reexports` is the number of re-exports that were followed so far.
     fn resolve(&self, module: &[String], names: &[String], reexports: usize) -> Option<ResolvedPath> {
         if reexports > MAX_REEXPORTS {
             return None;
@@ -136,7 +136,7 @@ impl Modules {
         Some(current)
     }
 
-    /// Resolves the name `name` that `module` imports from elsewhere.
+    /// Resolves `name` if `module` imports it, by its own name or with `*`.
     fn reexport(&self, module: &[String], name: &str, reexports: usize) -> Option<ResolvedPath> {
         let bindings = self.bindings.get(module)?;
         if let Some(binding) = bindings.iter().find(|binding| binding.name.as_deref() == Some(name)) {

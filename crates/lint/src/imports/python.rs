@@ -1,5 +1,4 @@
-//! The imports of Python packages: every `import` statement, including those in functions and those for type checkers
-//! only.
+//! The imports of Python packages: every `import` statement, even in functions or under `if TYPE_CHECKING`.
 
 use super::{Binding, ModulePath, Modules, PackageImports, WrittenPath};
 use crate::source::{SourceTree, is_test};
@@ -104,8 +103,8 @@ fn code_lines(source: &str) -> Vec<String> {
     code.lines().map(str::to_owned).collect()
 }
 
-/// Returns the names that an import statement defines, each with the path of its target, which starts with `crate`. The
-/// name is `None` for `*`.
+/// Returns the names that an import statement defines, each with the path of its target. A path starts with `crate`, as
+/// in Rust. The name is `None` for `*`.
 fn bindings(text: &str, package: &str, module: &[String], is_package: bool) -> Vec<(Option<String>, Vec<String>)> {
     let mut words = text.split_whitespace();
     match words.next() {

@@ -12,7 +12,7 @@ pub(super) enum Item {
     Module { inside: Vec<String>, name: String, path: Option<String> },
     /// A name that a `use` item defines; `None` for `*`.
     Use { inside: Vec<String>, name: Option<String>, target: Vec<String>, line: usize },
-    /// A path of at least two names, outside `use` items.
+    /// A path of at least two names in code that is not a `use` item.
     Path { inside: Vec<String>, names: Vec<String>, line: usize },
 }
 
@@ -36,7 +36,7 @@ struct Scanner {
     items: Vec<Item>,
     /// The number of open braces.
     depth: usize,
-    /// The names of the current inline modules, each with the depth of its content.
+    /// The names of the inline modules around the current token, each with the number of open braces in its content.
     inside: Vec<(String, usize)>,
 }
 
@@ -126,7 +126,7 @@ impl Scanner {
         self.position += 1;
     }
 
-    /// Skips all tokens up to the next `open`, and from there up to the matching `close`.
+    /// Skips all tokens up to and including the `close` that matches the next `open`.
     fn skip_past_matching(&mut self, open: char, close: char) {
         let mut depth = 0_usize;
         while let Some(token) = self.peek(0) {
@@ -146,7 +146,7 @@ impl Scanner {
 
     /// Skips the item, statement, field or match arm after a test attribute.
     fn skip_item(&mut self) {
-        // A field is `name: type`, possibly after `pub` or `pub(…)`. It ends at a comma, unlike an item.
+        // A field is `name: type`, possibly after `pub` or `pub(…)`. Unlike an item, a field ends at a comma.
         let is_field = {
             let mut ahead = 0;
             if self.is_word(0, "pub") {
@@ -249,7 +249,7 @@ impl Scanner {
                 return;
             }
             let Some(word) = self.word(0) else {
-                // This token cannot be part of a `use` item. Skips it.
+                // Skips a token that cannot be part of a `use` item.
                 self.position += 1;
                 return;
             };

@@ -31,7 +31,8 @@ pub(super) struct ClientLease {
     name: Bytes,
     time: Duration,
     last_reply: u64,
-    /// Requests whose replies were not received, oldest first. The oldest one's reply has the number `last_reply` + 1.
+    /// Requests whose replies were not received, oldest first. The next reply, with the number `last_reply` + 1,
+    /// answers the oldest request.
     waiting: VecDeque<SessionRequest>,
 }
 
@@ -67,7 +68,7 @@ impl ClientLease {
         })
     }
 
-    /// Stores a request that is being sent, to send it again after a resumption.
+    /// Stores a request that is being sent, so that it can be sent again after a resumption.
     pub(super) fn on_request(&mut self, request: &SessionRequest) {
         self.waiting.push_back(request.clone());
     }
@@ -103,7 +104,7 @@ impl ClientLease {
 
     async fn attempt(&self, connection: &Connection) -> Result<RawStream, ResumeFailure> {
         let resume = proto::Resume { lease: self.name.clone(), last_reply: self.last_reply };
-        // tonic's channel reconnects by itself.
+        // No new channel is needed: tonic's channel reconnects by itself.
         let begun = RawStream::begin(connection, resume, self.waiting.len()).await.map_err(|_| ResumeFailure::Retry)?;
         let mut stream = begun.map_err(ResumeFailure::from_status)?;
         let limit = connection.timeouts().reply;
@@ -116,7 +117,7 @@ impl ClientLease {
         {
             return Err(ResumeFailure::Retry);
         }
-        // Any other response, most likely an error, is final.
+        // Any response other than `Resumed`, most likely an error, is final.
         let resumed = proto::Resume::reply(response).map_err(|_| ResumeFailure::Permanent)?;
         let arrived = resumed.last_reply.checked_sub(self.last_reply).ok_or(ResumeFailure::Permanent)?;
         let arrived = usize::try_from(arrived).map_err(|_| ResumeFailure::Permanent)?;

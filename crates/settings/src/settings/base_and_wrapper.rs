@@ -7,15 +7,16 @@ use toml::Table;
 use super::{A2cConfig, Architecture, ConfigError, EpoptConfig, PpoConfig, Rl2Config};
 use crate::value_error::{ValueError, require};
 
-/// Settings of the base algorithm that EPOpt does not have, because each of its iterations learns from complete
+/// Settings of base algorithms that do not exist with EPOpt, because each iteration of EPOpt learns from complete
 /// episodes in one batch.
 const NOT_WITH_EPISODES: [&str; 2] = ["n_steps", "n_minibatches"];
 
 /// Maximal number of samples in a rollout. That many samples take some gigabytes.
 const MAX_SAMPLES: u128 = 1 << 26;
 
-/// Minimal number of steps of each environment in a rollout that counts as long. Below it, sending a policy's weights
-/// to the server takes longer than sending the observations and actions of several trainings together.
+/// Minimal number of steps of each environment in a rollout that counts as long. For shorter rollouts, sending the
+/// policy's weights to the server takes longer than sending observations and actions in messages that several trainings
+/// share.
 const LONG_ROLLOUT: usize = 64;
 
 /// The settings of an algorithm. The variants of both fields determine the algorithm.
@@ -56,7 +57,8 @@ pub enum Wrapper {
 pub enum CollectionMode {
     /// The training collects no rollouts, because a random policy learns nothing.
     None,
-    /// Rollouts have few steps. Several trainings share the messages to the server.
+    /// Rollouts have few steps. Several trainings share a session, so that one message carries the steps of all of
+    /// them.
     Short,
     /// Rollouts have many steps, or complete episodes. The server can choose the actions if it gets the weights for
     /// each rollout.
@@ -66,7 +68,7 @@ pub enum CollectionMode {
 }
 
 impl Settings {
-    /// Returns all algorithms with the default settings of their parts, in the order in which they are listed.
+    /// Returns all algorithms with their default settings, in the order in which users see them.
     pub fn all() -> [Self; 7] {
         let (a2c, ppo) = (|| Base::A2c(A2cConfig::default()), || Base::Ppo(PpoConfig::default()));
         let epopt = || Wrapper::Epopt(EpoptConfig::default());
@@ -88,7 +90,7 @@ impl Settings {
         Self::all().map(|settings| settings.name())
     }
 
-    /// Returns how rollouts are collected, apart from noise on observations.
+    /// Returns how rollouts are collected if no noise is added to observations.
     pub(super) fn rollouts(&self) -> CollectionMode {
         let n_steps = match (&self.wrapper, &self.base) {
             (_, Base::Random) => return CollectionMode::None,

@@ -276,8 +276,8 @@ fn flag(key: &str, value: &Value) -> String {
     }
 }
 
-/// Returns an error if the command line has two different values for one setting, because it is unknown which was
-/// intended.
+/// Returns an error if the command line has two different values for one setting, because the user may have intended
+/// either value.
 fn refuse_contradictions(typed: &[(String, Table)]) -> Result<(), ConfigError> {
     let same = |a: &Value, b: &Value| match (a, b) {
         (Value::String(a), Value::String(b)) => names::is_spelled(a, b),
@@ -321,7 +321,7 @@ static ALL_KEYS: LazyLock<Vec<String>> = LazyLock::new(|| {
 /// Returns every key that a configuration with this algorithm may have, with its default.
 fn defaults_of(config: &TrainConfig) -> Table {
     let mut defaults = config.full_table();
-    // These settings are written only if they are not the default.
+    // `full_table` leaves out these settings if they have their defaults, so they are added here.
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
     if !config.settings.is_random() {
@@ -346,7 +346,8 @@ fn choices(key: &str) -> Option<Vec<&'static str>> {
     })
 }
 
-/// Merges `layers` over the defaults of the algorithm that they name, and checks the result.
+/// Merges `layers` with the defaults of the algorithm that they name, and checks the result. Each layer is a table with
+/// a name for error messages.
 fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError> {
     // Replaces the values that are names by their usual spelling.
     for (key, value) in layers.iter_mut().flat_map(|(_, table)| table.iter_mut()) {
@@ -355,7 +356,8 @@ fn resolve(mut layers: Vec<(String, Table)>) -> Result<TrainConfig, ConfigError>
             *value = known[place].into();
         }
     }
-    // The algorithm, the architecture and the preset determine the defaults. The last layer that names them counts.
+    // The algorithm, the architecture and the preset determine the defaults. Each is taken from the last layer that
+    // contains it.
     let named = |key: &str| layers.iter().rev().find_map(|(_, table)| table.get(key));
     let algorithm = named(ALGORITHM).cloned().unwrap_or_else(|| "ppo".into());
     let algorithm = Settings::all()[choice(ALGORITHM, &algorithm, &Settings::names())?].clone();

@@ -47,8 +47,8 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
         Base::A2c(a2c) => (a2c.bootstrap_truncation, a2c.vf_coef) = (false, HALF * a2c.vf_coef),
         Base::Ppo(ppo) => {
             (ppo.bootstrap_truncation, ppo.vf_coef, ppo.n_epochs) = (false, HALF * ppo.vf_coef, 10);
-            // Rollouts are an eighth as long as with the preset "perturb", so a line of the log covers about the same
-            // number of steps. Nothing else depends on this setting.
+            // Rollouts have an eighth of the steps of rollouts with the preset "perturb". With this interval a line of
+            // the log covers about as many steps. Nothing else depends on this setting.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
         Base::Random => {}
@@ -60,7 +60,7 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
 }
 
 /// Factor for the weight of the value loss. The code of Packer et al. (2018) uses half of the squared error as the
-/// value loss; ours is the whole squared error.
+/// value loss; perturb uses the whole squared error.
 const HALF: f64 = 0.5;
 
 /// Removes the settings that earlier versions of the program did not have, if they are set to the behaviour of those
