@@ -150,7 +150,7 @@ async fn serve(
     let handshakes = Handshakes { limit: parts.handshake, tls: security.tls.clone() };
     let has_metrics = metrics.is_some();
     let _metrics_server = metrics.map(|listener| answer_scrapers(listener, &sources)); // stops when this function returns
-    // One gRPC server for each transport thread. The first runs on this thread.
+    // Starts a gRPC server for each transport thread. The first server runs on this thread.
     let mut servers = JoinSet::new();
     let (threads, accepted) = TransportThreads::new(balance);
     for (index, accepted) in accepted.into_iter().enumerate() {

@@ -20,7 +20,8 @@ use std::sync::{
     atomic::{AtomicU32, Ordering},
 };
 
-/// The auditor of one session's, or one dm_env_rpc world's, draws of parameters: it checks them and records them.
+/// The auditor of the draws of parameters of one session, or of one world of dm_env_rpc. It checks the draws and
+/// records them.
 #[derive(Clone)]
 pub struct DrawAuditor {
     bearer: Option<Bearer>,
@@ -37,7 +38,8 @@ const MAX_LOGGED_REFUSALS: u32 = 100;
 /// The number of bytes of a ledger line that are charged as one step.
 const LINE_BYTES_PER_STEP: usize = 16;
 
-/// Draws that the ledger has recorded before they happen. If they fail, the ledger must record that as well.
+/// Draws that the ledger has recorded before they happen. If the draws then do not happen, the ledger must record this
+/// as well.
 #[derive(Default)]
 pub struct PendingDraws(Vec<DrawStart>);
 
@@ -59,7 +61,8 @@ struct NextDraw<'a> {
 }
 
 impl DrawAuditor {
-    /// Makes the auditor of a new session. `None` for `bearer` or `ledger`: no token, or no ledger.
+    /// Makes the auditor of a new session. `bearer` is `None` if the session has no token. `ledger` is `None` if the
+    /// server has no ledger.
     pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
         let session = ledger.as_ref().map_or(0, Ledger::session);
         Self { bearer, ledger, session, refused: Arc::default() }
@@ -124,8 +127,8 @@ impl DrawAuditor {
             let are_drawn =
                 |of_box: &[Distribution]| of_box.iter().zip(&saved.values).all(|(set, value)| set.contains(*value));
             if !boxes.clone().any(are_drawn) {
-                // Its parameters cannot have come from its distributions: the client may have forged the snapshot. The
-                // parameters stay in force until the trial ends, so they are checked like a draw.
+                // The snapshot's parameters cannot have come from its distributions, so the client may have forged the
+                // snapshot. The parameters stay in force until the trial ends, so they are checked like a draw.
                 starts.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
             }
             starts.push((saved.draw, saved.distributions));
@@ -141,7 +144,7 @@ impl DrawAuditor {
     }
 
     /// Records that the draws of `pending` did not happen, because the environments in `slots` could not be restored.
-    /// They continue as before.
+    /// These environments continue as before.
     pub fn restore_failed(&self, batch: &Batch, slots: &[usize], pending: PendingDraws) {
         let spec = batch.settings().spec;
         let previous: Vec<_> = slots.iter().map(|slot| (batch.draw(*slot), batch.distributions(*slot))).collect();

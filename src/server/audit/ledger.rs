@@ -116,7 +116,8 @@ impl Ledger {
     /// # Errors
     /// [`Error::NoLedger`] if the file cannot be written, [`Error::Value`] if the line would be too long.
     pub async fn write(&self, event: LedgerEvent) -> Result<usize, Error> {
-        // The length of requests is limited, but the same numbers take more bytes as text.
+        // The length of requests is limited, but numbers take more bytes as text, so the length of the line is checked,
+        // too.
         let size = line_bytes(&event);
         if size as u64 > MAX_LINE_BYTES / 2 {
             let got = format!("{size} bytes as a line of this server's ledger");
@@ -137,7 +138,8 @@ impl Ledger {
         Err(Error::NoLedger { reason })
     }
 
-    /// Queues an event without waiting. If it cannot be written, it is tried again with the next event.
+    /// Queues an event without waiting. If the event cannot be written, the writer thread tries again with the next
+    /// event.
     pub fn write_later(&self, event: LedgerEvent) {
         let _ = self.lines.send((event, None));
     }

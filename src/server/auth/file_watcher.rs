@@ -53,8 +53,8 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 
 impl FileWatcher {
     /// Starts a thread that calls `reload` with the contents of the files whenever they have changed from `before`. A
-    /// change is taken up once two successive readings are equal, because a writer may still be writing. A [`Reloader`]
-    /// skips this check. Errors are logged, and watching continues.
+    /// change counts when two successive readings are equal, because another program may still be writing. A
+    /// [`Reloader`] skips this check. Errors are logged, and watching continues.
     ///
     /// # Errors
     /// If the operating system cannot start a thread.

@@ -1,5 +1,6 @@
 //! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that has exceeded
-//! the rate waits before its next request is handled. An idle client may make up for at most one second.
+//! the rate waits before its next request is handled. A client that was idle may run at most one second's steps faster
+//! than the rate.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},
@@ -7,7 +8,7 @@ use std::{
 };
 use tokio::time::{Instant, sleep};
 
-/// The time, in seconds, whose steps an idle client may make up for.
+/// The maximum time, in seconds, for which an idle client saves steps that it may later run faster than the rate.
 const BURST_SECONDS: f64 = 1.0;
 /// The maximum wait. A request that would wait longer is refused, because clients wait a minute for a reply.
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);

@@ -29,7 +29,7 @@ const ACCEPT_RETRY_DELAY: Duration = Duration::from_millis(200);
 #[derive(Clone)]
 pub struct TransportThreads {
     threads: Arc<[mpsc::UnboundedSender<Accepted>]>,
-    /// Locked once for each new connection, never for a request.
+    /// The mutex is locked once for each new connection, never for a request.
     balance: Arc<Mutex<Balance>>,
 }
 
@@ -67,8 +67,8 @@ pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: Transport
     }
 }
 
-/// Runs `future` on a new thread with a new runtime. Returns a future of the result. If that is dropped, the thread
-/// ends.
+/// Runs `future` on a new thread with a new runtime. Returns a future of the result. If the returned future is dropped,
+/// the thread ends.
 ///
 /// # Errors
 /// If the operating system cannot start a thread.
@@ -85,7 +85,7 @@ pub fn spawn<T: Send + 'static>(
                 () = done.closed() => None,
             }
         });
-        // Does not wait for connections that are still open.
+        // The thread does not wait for connections that are still open.
         runtime.shutdown_background();
         if let Some(output) = ended {
             let _ = done.send(output); // fails if the result is no longer wanted

@@ -91,7 +91,7 @@ struct ActiveLease<R> {
 
 struct StoredReply<R> {
     response: R,
-    /// The memory reservation for storing the reply. If there is `None`, the reply is dropped as soon as it is sent.
+    /// The memory reservation for storing the reply. If it is `None`, the reply is dropped as soon as it is sent.
     memory: Option<MemoryReservation>,
     /// The memory reservation that the handler made for the response. It is passed on when the response is first sent.
     outgoing: Option<MemoryReservation>,
@@ -215,8 +215,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         let Reply { response, memory, handover } = reply;
         let resumed = match handover {
             Some(StreamHandover::Lease(grant)) => {
-                // After the loss of a stream, a client with a lease resends its unanswered requests. So none may be
-                // read ahead.
+                // After the loss of a stream, a client with a lease resends its unanswered requests. So no request may
+                // be read ahead of its turn.
                 self.exchange.reads_ahead = false;
                 self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None

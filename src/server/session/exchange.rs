@@ -151,7 +151,7 @@ impl<H: SessionHandler> Exchange<H> {
             Message::Refused(error) => return Ok(self.refuse_undecoded(error)),
         };
         // A client that exceeds its token's rate waits before its request is decoded. Requests are read ahead only for
-        // tokens without a rate, so such a request need not wait.
+        // tokens without a rate, so a request that was read ahead need not wait.
         let bearer = self.requests.bearer.clone();
         let was_open = self.handler.is_open();
         if let Err(error) = self.pace(bearer.as_ref().filter(|_| was_open && !self.was_read_ahead)).await? {
@@ -209,7 +209,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Completes a request: charges the token, counts an error, and turns it into its in-band reply.
+    /// Completes a request: charges the token. If the answer is an error, counts it and converts it to an in-band
+    /// reply.
     pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
         self.charge();
         if self.was_open || self.handler.is_open() {

@@ -217,7 +217,7 @@ impl<R> Leases<R> {
             return Ok(None);
         }
         let name = random()?;
-        // One place is enough: the session answers one resume request at a time.
+        // A capacity of one is enough, because the session answers one resume request at a time.
         let (sender, resume_requests) = mpsc::channel(1);
         self.lock().push(LeaseEntry { name, bearer, resume_requests: sender });
         self.0.counters.0.held.fetch_add(1, Ordering::Relaxed);

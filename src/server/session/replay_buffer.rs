@@ -21,8 +21,8 @@ impl<R> ReplayBuffer<R> {
         self.last
     }
 
-    /// Records that a request arrived, and drops replies that the client has received: with this request, at most
-    /// `max_unanswered` requests are unanswered.
+    /// Records that a request arrived. A client sends a request only while fewer than `max_unanswered` are unanswered,
+    /// so it has received all older replies. Drops these replies.
     pub fn on_request(&mut self) {
         let received = (self.replies.len() + 1).saturating_sub(self.max_unanswered);
         self.replies.drain(..received);

@@ -131,9 +131,9 @@ impl PendingReservations {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).push(reservation);
     }
 
-    /// Attaches all queued reservations, and the value that `hold` returns, to the bytes of a reply. They are released
-    /// when the last of the bytes has been written or dropped. If no reservation is queued, returns the bytes
-    /// unchanged.
+    /// Attaches all queued reservations, and the value that `hold` returns, to the bytes of a reply. The reservations
+    /// and the value are released when the last of the bytes has been written or dropped. If no reservation is queued,
+    /// returns the bytes unchanged.
     pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
         let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
         if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }

@@ -1,5 +1,5 @@
 //! Withholds the request bodies of sessions from tonic, which would decode their messages itself. [`MessageReader`]
-//! reads them instead.
+//! reads these bodies instead.
 
 use super::{
     budget::PendingReservations,

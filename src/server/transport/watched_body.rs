@@ -17,7 +17,7 @@ use tokio::{
 };
 use tonic::{Status, body::Body};
 
-/// The number of checks for unread replies within their timeout.
+/// The number of times that unread replies are checked within the length of their timeout.
 const CHECKS_PER_TIMEOUT: u32 = 4;
 
 /// The maximum times for which a stream's client may leave replies unread.

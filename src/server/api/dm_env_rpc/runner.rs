@@ -137,7 +137,7 @@ impl Runner {
         if self.phase != EpisodePhase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
             self.draws.reset(&self.batch, &entries).await?;
-            // Set before the reset: if the reset fails, the next call resets again.
+            // These fields are set before the reset, so that the next call resets again if the reset fails.
             (self.phase, self.version, self.seed) = (EpisodePhase::Over, version, seed.unwrap_or(self.seed));
             let (first, started) = self.batch.reset(entries).await?;
             (self.first, self.start) = (first, only(started));

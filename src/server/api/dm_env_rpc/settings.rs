@@ -22,7 +22,7 @@ const MAX_NAME_BYTES: usize = 64;
 
 type WorldSettings = BTreeMap<String, Tensor>;
 
-/// The requested name of a world, and who may reset and destroy it.
+/// The requested name of a world, and whether other streams may reset and destroy the world.
 pub(super) struct Ownership {
     /// The requested name; `None` for a random name.
     pub(super) name: Option<String>,
@@ -136,7 +136,7 @@ pub(super) fn check_none(request: &'static str, settings: &WorldSettings) -> Res
 /// Parses the letter of a version.
 ///
 /// # Errors
-/// If it is not D, R or E.
+/// If `letter` is not D, R or E.
 pub(super) fn parse_version(field: String, letter: &str) -> Result<Version, Error> {
     let found = letter.parse().ok().filter(|version| Version::ALL.contains(version));
     found.ok_or_else(|| Error::value(field, format!("{:?}", shorten(letter)), "\"D\", \"R\" or \"E\""))

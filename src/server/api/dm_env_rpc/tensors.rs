@@ -59,8 +59,8 @@ pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Resu
     within.ok_or_else(|| Error::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
 }
 
-/// Returns the elements of an INT32 tensor of this shape. A single element stands for all. `bounds` has one range for
-/// each element.
+/// Returns the elements of an INT32 tensor of this shape. A tensor with a single element stands for a tensor of equal
+/// elements. `bounds` has one range for each element.
 ///
 /// # Errors
 /// If `tensor` has another type or shape, or an element is out of its bounds.
@@ -71,8 +71,8 @@ pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i
     }
 }
 
-/// Returns the elements of a FLOAT tensor of this shape. A single element stands for all. `bounds` has one range for
-/// each element.
+/// Returns the elements of a FLOAT tensor of this shape. A tensor with a single element stands for a tensor of equal
+/// elements. `bounds` has one range for each element.
 ///
 /// # Errors
 /// If `tensor` has another type or shape, or an element is out of its bounds.
@@ -84,8 +84,8 @@ pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f
 }
 
 /// Checks the shape and bounds of a tensor with the elements `given`, and returns one element for each of `bounds`. As
-/// dm_env_rpc allows, a single element stands for all, and one dimension may be negative, to be inferred from the
-/// number of elements; but not both.
+/// in dm_env_rpc, a tensor with a single element stands for a tensor of equal elements, and a negative dimension is
+/// inferred from the number of elements. A tensor may not use both rules.
 fn elements<T: Copy + PartialOrd + Display>(
     field: &str,
     tensor: &Tensor,

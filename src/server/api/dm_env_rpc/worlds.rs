@@ -68,7 +68,7 @@ struct WorldEntry {
     shared: bool,
     /// The runner of the world's episodes; `None` while an agent has it.
     runner: Option<Runner>,
-    /// The environment taken from the quota of the maker's token.
+    /// The guard that takes one environment from the quota of the maker's token.
     _held: Option<QuotaGuard>,
 }
 

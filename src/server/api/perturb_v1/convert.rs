@@ -32,7 +32,8 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
         vec![group(spec, "open", "open.batch_size", single(request))?]
     } else {
         check_no_single(&request)?;
-        // Checked before the groups are converted. Each group has at least one environment.
+        // Each group has at least one environment, so there cannot be more groups than environments. This is checked
+        // before the groups are converted.
         if request.groups.len() > max_envs {
             let got = format!("{} groups", request.groups.len());
             return Err(Error::value(
@@ -54,7 +55,7 @@ fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result
     let groups = open.groups.iter().map(|group| &group.parameters);
     let mut names: Vec<&str> =
         groups.chain([&open.parameters]).flat_map(|named| named.keys().map(String::as_str)).collect();
-    // Sorted, so that the same request always gets the same error.
+    // The names are sorted, so that the same request always gets the same error.
     names.sort_unstable();
     Ok(disturbance::with_parameters(spec, names)?)
 }
@@ -119,7 +120,7 @@ fn override_parameters(
     base: &mut [Distribution],
     parameters: &HashMap<String, proto::Distribution>,
 ) -> Result<(), Error> {
-    // Sorted, so that the same request always gets the same error.
+    // The parameters are sorted by name, so that the same request always gets the same error.
     let mut parameters: Vec<_> = parameters.iter().collect();
     parameters.sort_by_key(|(name, _)| *name);
     let mut overrides = Vec::with_capacity(parameters.len());
@@ -131,7 +132,7 @@ fn override_parameters(
 }
 
 /// Checks the actions of a step: little-endian i32 `[N]` or f32 `[N, A]`, where N is the batch size `size`. Choices
-/// must be in range, numbers finite.
+/// must be in range, and numbers must be finite.
 pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Error> {
     const FIELD: &str = "step.actions";
     let (element, width) = match spec.action {

@@ -56,7 +56,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
     let sizes = Sizes { envs: n_envs, observation, parameters, action };
     let proto::Act { policy: given, weights: given_weights, task: given_task, most_steps, only_ended } = request;
     let task = task(given_task)?;
-    // The policy: a new one with its weights, or the current one, maybe with new weights.
+    // The request has a new policy with its weights, or continues the current policy, maybe with new weights.
     let (policy, given_weights) = match (given, batch.policy_runner()) {
         (Some(_), _) if given_weights.is_empty() => {
             return Err(order("with a new policy but without its weights", "send both together"));
@@ -71,7 +71,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
             (None, new_weights.transpose()?)
         }
     };
-    // The task: a new one, unless the current policy has an unfinished one.
+    // The request must have a new task, unless the current policy has an unfinished task.
     let unfinished = policy.is_none() && batch.policy_runner().is_some_and(|runner| !runner.task().is_done());
     match (&task, unfinished) {
         (None, false) => return Err(order("without a task and none is unfinished", "name steps or episodes")),

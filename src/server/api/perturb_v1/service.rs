@@ -32,7 +32,7 @@ pub struct PerturbService {
 }
 
 impl PerturbService {
-    /// Makes a service whose sessions use the parts `shared`, within the limits of `sessions`.
+    /// Makes a service whose sessions use the parts of the server in `context`, within the limits of `sessions`.
     pub fn new(context: ServerContext, sessions: Sessions) -> Self {
         Self { context: Arc::new(context), sessions, counts: RequestCounters::new::<Session>() }
     }

@@ -48,11 +48,11 @@ pub struct Session {
     context: Arc<ServerContext>,
     batch: Option<Batch>,
     bearer: Option<Bearer>,
-    /// The environments taken from the quota of the session's token.
+    /// The guard that takes the session's environments from the quota of its token.
     env_quota: Option<QuotaGuard>,
     draws: DrawAuditor,
     budget: Budget,
-    /// An upper bound of the length of one snapshot, bytes, until a distribution gets more intervals.
+    /// An upper bound of the length of one snapshot, bytes. The bound holds until a distribution gets more intervals.
     snapshot_bytes: usize,
     /// The memory reserved for the requests and replies of steps.
     step_memory: Option<MemoryReservation>,

@@ -22,8 +22,8 @@ const FRAMING_BYTES: usize = 256;
 /// The number of integers in a row of `Stepped.receipt_episodes`.
 const RECEIPT_INDICES: usize = 5;
 
-/// Returns the estimated memory of an ended or started episode with its receipt, bytes. Each number is there as a value
-/// and encoded in the reply.
+/// Returns the estimated memory of an ended or started episode with its receipt, bytes. Each number is in memory twice:
+/// as a value, and encoded in the reply.
 fn receipt_bytes(settings: &BatchSettings) -> usize {
     let numbers = settings.spec.parameters.len() + settings.spec.applied.len();
     RECEIPT_OVERHEAD_BYTES + 2 * size_of::<f64>() * numbers
@@ -55,7 +55,8 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
 }
 
 /// Returns the memory that a session reserves when it is opened, bytes: two step requests and three replies (one being
-/// computed, one waiting, one being sent). Thanks to it, no step is refused because of other sessions.
+/// computed, one waiting, one being sent). With this reservation, no step is refused because of the memory that other
+/// sessions use.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * receipt_bytes(settings) } else { EPISODE_END_BYTES };
