@@ -1,6 +1,7 @@
 """PPO in one file, in the manner of CleanRL, on a batch of environments in same-step autoreset mode. Needs PyTorch.
 
-The return of a truncated episode continues with the value of its final observation, which comes with the same step.
+The return of a truncated episode is bootstrapped with the value of its final observation, which is in the infos of the
+episode's last step.
 Run: python cleanrl_ppo.py [--version R] [--steps 100000] [--server unix:/path]
 """
 

@@ -35,7 +35,7 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
     rows = [first] + [wrapped.step(np.array([np.sin(step)], dtype=np.float32))[0] for step in range(30)]
     wrapped.close()
     own = observations(30, server=server, parameters={"sensor_delay": 4})
-    # In the first four steps, Gymnasium's wrapper returns zeros.
+    # Leave out the first four steps, in which Gymnasium's wrapper returns zeros.
     np.testing.assert_array_equal(np.stack(rows)[4:], own[4:])
 
 

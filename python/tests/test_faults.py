@@ -422,7 +422,7 @@ def test_collection_while_private_server_is_acquired() -> None:
 
 
 def test_process_closes_sessions_before_its_server() -> None:
-    """Otherwise the server would wait a second for open sessions."""
+    """If the sessions were still open, the server would wait a second for them."""
     ending = """
 from pathlib import Path
 import perturb

@@ -74,10 +74,11 @@ def test_sampled_contexts_are_prefixes_of_larger_samples() -> None:
         within = [(values >= low) & (values <= high) for low, high in parameter.extreme]
         assert np.logical_or.reduce(within).all()
         widths = np.array([high - low for low, high in parameter.extreme])
-        # The share of 400 draws is uncertain by 0.025; five of that.
+        # A share of 400 draws has a standard error of 0.025. The tolerance is five standard errors.
         assert within[0].mean() == pytest.approx(widths[0] / widths.sum(), abs=0.125)
         for inside, (low, high) in zip(within, parameter.extreme, strict=True):
-            # The mean of 100 uniform numbers and more is uncertain by 0.03 of the width; five of that.
+            # The mean of 100 or more uniform numbers has a standard error of at most 0.03 of the interval's width. The
+            # tolerance is five standard errors.
             assert values[inside].mean() == pytest.approx((low + high) / 2, abs=0.15 * (high - low))
 
 

@@ -65,7 +65,7 @@ pub fn picture<'py>(py: Python<'py>, data: &[u8], size: [usize; 3]) -> PyResult<
 /// Decodes little-endian float32 numbers.
 ///
 /// # Errors
-/// If their number is not that of an array with this shape.
+/// If the number of bytes does not fit an array of this shape.
 pub fn numbers(data: &[u8], shape: &[usize]) -> PyResult<Vec<f32>> {
     let (words, rest) = data.as_chunks::<4>();
     let expected = shape.iter().try_fold(1_usize, |size, length| size.checked_mul(*length));

@@ -76,10 +76,10 @@ impl EpisodeTable {
     }
 }
 
-/// The content of a message about an episode: its slot, and the episode and the receipt if the message has them.
+/// The content of a message about an episode: its slot, its indices and its receipt. A message may lack the latter two.
 pub type EpisodeMessage<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto::Receipt>);
 
-/// Returns the error for episodes that do not fit the batch.
+/// Returns the error for a reply whose episodes or receipts do not fit the session.
 pub fn mismatched_episodes() -> PyErr {
     failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of other lengths")
 }

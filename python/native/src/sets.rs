@@ -18,8 +18,8 @@ use crate::requests::IntervalsByName;
 /// grid or a list.
 pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
-/// Makes a test set from the values of each parameter in the syntax of experiment files. Intervals make a drawn set,
-/// and points make a grid.
+/// Makes a test set from the values of each parameter in the syntax of experiment files. If they are intervals,
+/// the set's parameters are drawn. If they are points, the set is a grid.
 #[pyfunction]
 pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyResult<Set> {
     let assignments = values.into_iter().map(|(parameter, values)| format!("{parameter}={values}").parse());

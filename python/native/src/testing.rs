@@ -1,4 +1,4 @@
-//! Tests of a policy that acts in Python. The choice of episodes and the records are those of `perturb evaluate`.
+//! Tests of a policy that acts in Python. The episodes and the records equal those of `perturb evaluate`.
 
 use std::sync::Arc;
 

@@ -86,8 +86,9 @@ class Assessment:
     def metrics(self) -> dict[str, float | None]:
         """The three metrics of Packer et al. (2018, arXiv:1810.12282), in %, by name.
 
-        `Default` is the success rate of scenario DD, and `Interpolation` is that of RR. `Extrapolation` is the
-        geometric mean of the success rates of DR, DE and RE. A metric is None if one of its scenarios was not tested.
+        In a scenario such as DR, the policy was trained on D and tested on R. `Default` is the success rate of DD, and
+        `Interpolation` that of RR. `Extrapolation` is the geometric mean of the success rates of DR, DE and RE. A metric
+        is None if one of its scenarios was not tested.
         """
         rates = {result.scenario: result.success_percent for result in self.results if result.trained_on is not None}
         return dict(zip(METRICS, _native.metrics(rates), strict=True))
@@ -160,7 +161,7 @@ class Assessment:
             UnknownNameError: if the scenario was not tested.
         """
         result, records = self._find(scenario)
-        # The rows of this test, and the context (a number from 0) of each of its episodes.
+        # The rows of this test, and for each of its episodes the number of its context, from 0.
         every = records.columns()
         tested = np.array(every["set"]) == result.tested_on
         columns = {name: np.asarray(values)[tested] for name, values in every.items()}
@@ -305,7 +306,7 @@ class Assessment:
         show it beside other assessments. `perturb audit` replays the tests if the policies were trained by perturb.
 
         Args:
-            folder: path of the folder. It must be new or empty, or hold an assessment and `overwrite` must be true.
+            folder: path of the folder. It must be new or empty. With `overwrite` it may also contain an assessment.
             overwrite: whether to replace an assessment that is in the folder.
 
         Raises:
@@ -378,7 +379,7 @@ class Assessment:
                 on to the policy.
             normalizer: as in `evaluate`.
             server: as in `evaluate`.
-            task: as in `evaluate`. If files in the folder have changed since, the episodes differ.
+            task: as in `evaluate`. If its files have changed since the recorded tests, the episodes differ.
             timeout: as in `evaluate`.
 
         Raises:

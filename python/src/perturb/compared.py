@@ -25,14 +25,15 @@ Table = Literal["means", "differences", "episodes"]
 # For each compared score: the heading of its column, and the heading of the column with differences.
 _HEADINGS = {"success": ("success, %", "points"), "return": ("return", "difference"), "length": ("length", "steps")}
 _INTERVALS = (
-    "Intervals have 95 %. Those over seeds are t intervals and speak of other seeds: they cover the mean in 95 % also "
-    "with three seeds if the means of seeds are normally distributed, where a bootstrap would cover 73 % (84 % with "
-    "five). With fewer than three seeds there are none. Those over episodes speak of these policies in other episodes. "
-    "p is of t tests over seeds, corrected after Holm for all differences."
+    "All intervals are 95 % confidence intervals. Intervals over seeds estimate what other training seeds would give. "
+    "They are t intervals, and need at least three seeds. If the means of seeds are normally distributed, they cover "
+    "the true mean in 95 % of cases even with three seeds; a bootstrap would cover it in 73 % (84 % with five seeds). "
+    "Intervals over episodes estimate what the same policies would give in other episodes. p is from t tests over "
+    "seeds, with Holm's correction for all differences."
 )
 _COUNTS = (
-    "Rows of a results table have no episodes. Intervals of success rates over episodes are from the numbers of "
-    "successes, as if all policies had played different episodes; returns and lengths have no interval over episodes."
+    "Rows of a results table have no episodes. Intervals of success rates over episodes are computed from the numbers "
+    "of successes, as if all policies had played different episodes. Returns and lengths have no such interval."
 )
 
 

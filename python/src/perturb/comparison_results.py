@@ -67,7 +67,7 @@ class ConditionDifference:
     same_episodes: bool
     # The probability, 0 … 1, that a policy of x has a higher mean score than a policy of y (Mann and Whitney, 1947).
     improvement: float
-    # The p-value of the paired t test, or of Welch's test without pairs.
+    # The p-value of the paired t test, or of Welch's test without pairs. None if `seeds_interval` is None.
     p: float | None
     # The p-value after Holm's correction for all differences of the comparison.
     p_holm: float | None

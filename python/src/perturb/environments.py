@@ -50,7 +50,7 @@ class Environment:
     Attributes:
         name: the name for `evaluate` and servers, such as `CartPole`.
         id: the id for `gymnasium.make`, such as `perturb/CartPole-v1`.
-        revision: a number that every change of dynamics, reward or observation raises.
+        revision: a number that increases with every change of dynamics, reward or observation.
         description: what the environment is.
         step_limit: the number of steps after which an episode is truncated.
         control_timestep: simulated time in one step, s.

@@ -69,7 +69,7 @@ def read(policy: _native.Policy) -> Network:
     layers = [(arrays[f"{name}.weight"], arrays[f"{name}.bias"]) for name in names if f"{name}.weight" in arrays]
     last = "policy" if recurrent else max(name.removesuffix(".weight") for name in arrays if _is_policy_layer(name))
     if not recurrent and f"{last}.weight" in arrays and layers and layers[-1][0] is arrays[f"{last}.weight"]:
-        layers.pop()  # a policy without hidden layers
+        layers.pop()  # with fewer than two hidden layers, the last one found is the output layer
     lstm = (arrays["lstm.input.weight"], arrays["lstm.recurrent.weight"], arrays["lstm.bias"]) if recurrent else None
     return Network(mean, deviation, bound, tuple(layers), lstm, (arrays[f"{last}.weight"], arrays[f"{last}.bias"]))
 

@@ -81,7 +81,7 @@ class TaskFolder:
 def _is_utf8(path: str) -> bool:
     try:
         path.encode()
-    except UnicodeEncodeError:  # Python's stand-ins for bytes that are not UTF-8
+    except UnicodeEncodeError:  # Python represents bytes that are not UTF-8 by characters that cannot be encoded
         return False
     return True
 
@@ -217,7 +217,7 @@ def _end(process: subprocess.Popen[bytes], directory: str, owner: int) -> None:
     shutil.rmtree(directory, ignore_errors=True)
 
 
-# The private servers of this process.
+# The private servers that this process started and that were not deleted.
 _running: weakref.WeakSet[LocalServer] = weakref.WeakSet()
 _lock = threading.Lock()
 # The shared servers, by class and task folder. The task folder is None for a server of the built-in environments.

@@ -75,7 +75,7 @@ def _require_untouched(model: Any) -> None:
     stable-baselines3 stores the last observations of a model in `_last_obs`. In `_last_original_obs` it stores the last
     observations before normalisation. On-policy algorithms set `_last_original_obs` only under a VecNormalize.
     Off-policy algorithms always set it. Under a VecNormalize `_last_obs` is then a scaled and shifted copy of
-    `_last_original_obs`; without one it has the observations of the following step.
+    `_last_original_obs`; without a VecNormalize, it has the observations of the following step.
     """
     original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
     if original is None:
@@ -88,7 +88,7 @@ def _require_untouched(model: Any) -> None:
     if not hasattr(model, "replay_buffer"):  # an on-policy model
         raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
     if model.get_env() is not None:
-        return  # its environment, which was trained in or given to load(), has no VecNormalize
+        return  # the model has its environment, from training or as an argument of load(), without a VecNormalize
     if last is None or np.shape(last) != np.shape(original) or len(original) < 3:
         raise PolicyError(
             f"this {type(model).__name__} model was loaded without its environment, so it is not known whether it was "

@@ -60,7 +60,7 @@ def parse(rule: SuccessRule | None) -> tuple[str | None, OwnRule | None]:
     """Parse a success rule. Return the rule for the native module, and the rule for Python.
 
     The native module applies its rule while episodes are recorded. Python applies its rule to the finished records. At
-    most one of the two is not None. `return=NUMBER` means at least this return.
+    least one of the two is None. `return=NUMBER` means at least this return.
 
     Raises:
         InvalidArgumentError: if the rule is neither a text nor a function, or if a threshold is malformed.

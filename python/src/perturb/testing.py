@@ -64,7 +64,7 @@ def replay(
         known, records = one.known, one.records
         acts, own_normalizer = given[one.trained_on]
         name = agent if records.policy == agent and not isinstance(acts, Policy) else None
-        # If Python judged these records, the rule may have been a function, which the records do not contain. Then the
+        # If Python judged these records, its rule may have been a function, which the records do not contain. Then the
         # columns `success` and `achieved` are not compared.
         own = success_rules.is_own(records.rule)
         settings = Settings(

@@ -307,8 +307,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
 
         Returns the observations [N, O]. Restored environments have the observations at which they were saved. Other
         environments have their last observations. The same actions then give the same bytes as after the snapshot. If
-        one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in total are restored in parts: if
-        one part is refused, the snapshots of the parts before it stay restored.
+        one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in total are restored in
+        parts. If one part is refused, the snapshots of the parts before it stay restored.
         """
         selected = None
         if mask is not None:

@@ -16,7 +16,7 @@ use crate::failure::{RequestFailure, TIMED_OUT, UNUSABLE, failure};
 use crate::infos::InfoKeys;
 use crate::session_runtime::{SessionRuntime, WaitError};
 
-/// Number of forks since the module was loaded, in the chain of processes that led to this process.
+/// Number of forks that lead from the process that loaded this module to this process.
 pub(super) static FORKS: AtomicU32 = AtomicU32::new(0);
 
 /// Counts a fork. Python calls this function in each forked process.
