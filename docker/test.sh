@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Runs a small experiment with compose.yaml twice: on one server with one learner, and on two servers with three
-# learners, of which one server is stopped in mid-run. Both must end with the same report. Then runs one over two tasks from
-# a mounted folder. Needs the two images, which `make docker` builds.
+# Runs a small experiment with compose.yaml twice: first on one server with one learner, then on two servers with three
+# learners. In the second run one of the servers is stopped. Both runs must end with the same report. Then runs an
+# experiment with two tasks from a mounted folder. Needs the two images, which `make docker` builds.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -60,13 +60,13 @@ for server in "${servers[@]}"; do
 done
 say "nobody is root, both servers are healthy"
 
-# Open sessions of a server.
+# now CONTAINER: prints the number of a server's open sessions, which it reads from the server's metrics.
 now() {
     docker exec "$1" bash -c 'exec 3<>/dev/tcp/127.0.0.1/9447; printf "GET /metrics HTTP/1.0\r\n\r\n" >&3; cat <&3' |
         sed -n 's/^perturb_sessions{} \([0-9]*\).*/\1/p'
 }
-# Finds a server with an open session and leaves all learners paused. A paused learner cannot end the session, however quick
-# the machine is, so that the server is certainly stopped in mid-run. Without such a server the learners go on.
+# Pauses all learners and looks for a server with an open session. If it finds one, the learners stay paused, so that
+# they cannot end the session before the script stops the server. Otherwise the learners continue, and the status is 1.
 catch_session() {
     docker pause "${learners[@]}" >/dev/null || fail "the learners ended before a server could be stopped"
     for index in 0 1; do

@@ -1,4 +1,4 @@
-# Functions of test.sh and test_guarded.sh: Compose, a temporary folder, and cleaning up at the end.
+# Functions that test.sh and test_guarded.sh share: running Compose, a temporary folder, and cleaning up at the end.
 
 if docker compose version >/dev/null 2>&1; then
     program=(docker compose)

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
-# Runs a small experiment with compose.yaml and guarded.yaml: servers that encrypt, learners that show certificates and
-# tokens. A learner with a wrong or expired certificate, a wrong token or a wrong role is refused with a sentence. Needs
-# the two images, which `make docker` builds.
+# Runs a small experiment with compose.yaml and guarded.yaml, i.e. with servers that use TLS and require certificates
+# and tokens from learners. Then checks that learners with a wrong or expired certificate, a wrong token or a wrong role
+# are refused with a clear message. Needs the two images, which `make docker` builds.
 set -euo pipefail
 cd "$(dirname "$0")"
 
@@ -13,7 +13,7 @@ export PERTURB_KEYS=$keys PERTURB_ADDRESS=https://server:7447 PERTURB_NAME=guard
 begun=$SECONDS
 
 ./keys.sh "$keys" >/dev/null
-chmod 755 "$keys" # Docker's daemon may be another user's
+chmod 755 "$keys" # Docker's daemon may run as another user
 ./keys.sh "$work/others" >/dev/null
 cp "$work/others/learner/learner.pem" "$keys/learner/stranger.pem"
 cp "$work/others/learner/learner.key" "$keys/learner/stranger.key"
@@ -48,7 +48,8 @@ codes=$(compose ps --quiet learner | xargs docker wait)
 [ "$(find "$work/runs/guarded" -name result.json | wc -l)" = 2 ] || fail "not both cells have a result"
 say "two servers and two learners with certificates and tokens: the report is there"
 
-# refused SENTENCE VERSION [VARIABLE=VALUE…]: a learner with these variables must fail with the sentence.
+# refused SENTENCE VERSION [VARIABLE=VALUE…]: runs a learner that trains on VERSION, with these environment variables.
+# The learner must fail, and its output must contain SENTENCE.
 refused() {
     local sentence=$1 version=$2 status=0 words arguments=()
     shift 2

@@ -1,4 +1,4 @@
-# A Debian with Python and nothing to compile with, in which `make wheel-test` installs the wheel.
+# An image of Debian with Python but without compilers. `make wheel-test` installs the wheel in it.
 FROM debian:bookworm-slim
 RUN apt-get update \
     && apt-get install --yes --no-install-recommends python3 python3-venv \

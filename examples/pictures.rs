@@ -8,7 +8,8 @@ use perturb::{
 };
 use std::{env, error::Error, fs::File, io::BufWriter, path::Path};
 
-/// Exact states that show what a task is about.
+/// The state in which each environment is drawn. A state has the entries of `EnvironmentSpec::state`, and shows the
+/// typical situation of the environment, e.g. a tilted pole.
 const SCENES: &[(&str, &[f64])] = &[
     ("CartPole", &[0.7, 0.0, 0.12, 0.0]),
     ("MountainCar", &[0.15, 0.0]),

@@ -1,10 +1,11 @@
-"""Asks a real Prometheus, which watches a server at work, for every expression of the dashboard.
+"""Checks that a real Prometheus has numbers for every expression of the Grafana dashboard.
 
     check.py PROGRAMS
 
-PROGRAMS is the folder of `perturb` and `perturb-server`. A server with tokens is trained on, filmed and misused, by
-clients that come back until the end; `prometheus` scrapes it. Every expression must come to finite numbers, and
-promtool must find nothing wrong in the page. Ends with 1 and the expressions that do not.
+PROGRAMS is the folder of `perturb` and `perturb-server`. The script starts a server with tokens, and a `prometheus`
+that scrapes it. Clients train, film and send requests without a token until the end. Each expression of
+perturb-server.json must have a finite value, and promtool must accept the server's page of metrics. Otherwise the
+script prints the faults and ends with status 1.
 """
 
 import contextlib
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-LIMIT = 240  # seconds: much longer than it takes, as the machine may be busy
+LIMIT = 240  # seconds for each wait, much more than on an idle machine
 TOKEN = "correct-horse-battery-staple"
 CONFIG = """
 global: { scrape_interval: 1s }
@@ -33,14 +34,15 @@ scrape_configs:
   - job_name: perturb-server
     static_configs: [{ targets: ["127.0.0.1:PORT"] }]
 """
-# What Grafana puts in their places.
+# Grafana's variables in the expressions, with the values that replace them here.
 VARIABLES = {"$__rate_interval": "30s", "$instance": ".*"}
-# promtool reads the page as the older format, in which counters are described with their `_total`.
+# A complaint of promtool that is ignored. promtool reads the page as the older text format, in which a counter's help
+# text belongs to its name with `_total`, so it finds none.
 KNOWN = "no help text"
 
 
 def free_port() -> int:
-    """A port that nobody had a moment ago."""
+    """Returns a port of the loopback interface that was free a moment ago."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         return free.getsockname()[1]
@@ -48,7 +50,7 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def running(command: list, **options: Any) -> Iterator[subprocess.Popen]:
-    """A process that is ended with the block."""
+    """Starts a process, and ends it at the end of the `with` block."""
     process = subprocess.Popen([str(part) for part in command], **options)
     try:
         yield process
@@ -62,7 +64,7 @@ def running(command: list, **options: Any) -> Iterator[subprocess.Popen]:
 
 
 def use(programs: Path, folder: Path, server: str, stop: threading.Event) -> None:
-    """Trains, films and is refused, again and again."""
+    """Trains, films, and sends a request without a token, which must be refused. Repeats this until `stop` is set."""
     known = dict(os.environ, PERTURB_TOKEN_FILE=str(folder / "token"))
     (folder / "token").write_text(TOKEN)
     stranger = {name: value for name, value in os.environ.items() if name != "PERTURB_TOKEN_FILE"}
@@ -78,7 +80,7 @@ def use(programs: Path, folder: Path, server: str, stop: threading.Event) -> Non
 
 
 def numbers(prometheus: str, expression: str) -> list[float]:
-    """What an expression comes to now."""
+    """Returns the current values of an expression, one for each time series."""
     for name, value in VARIABLES.items():
         expression = expression.replace(name, value)
     query = urllib.parse.urlencode({"query": expression})
@@ -87,7 +89,7 @@ def numbers(prometheus: str, expression: str) -> list[float]:
 
 
 def wait(what: str, done: Callable[[], object]) -> None:
-    """Until it is done."""
+    """Waits until `done` returns a true value. Ends the script after `LIMIT` seconds."""
     end = time.monotonic() + LIMIT
     while True:
         with contextlib.suppress(OSError):
@@ -99,7 +101,7 @@ def wait(what: str, done: Callable[[], object]) -> None:
 
 
 def check(programs: Path, folder: Path) -> None:
-    """Watches a server that is used, until every expression has numbers."""
+    """Runs the server, its clients and Prometheus until every expression has a finite value."""
     ports = [free_port() for _ in range(3)]
     server, metrics, prometheus = (f"127.0.0.1:{port}" for port in ports)
     (folder / "tokens.toml").write_text(f'[[token]]\nname = "ann"\ntoken = "{TOKEN}"\n')

@@ -2,10 +2,11 @@
 
     check.py [VERSION …]
 
-Every document must satisfy the schema of each VERSION of Kubernetes, without unknown fields. What the manifests say of
-the server and the learner must be true: settings are those of docs/operations.md, ports agree, the pod outlives the
-grace period, labels select what they are meant to, and alerts name metrics of docs/monitoring.md. promtool checks rules
-and configuration. Run from the repository's root; ends with 1 and all faults.
+Each document of the manifests must satisfy the schema of each VERSION of Kubernetes, without unknown fields. The
+manifests must also agree with the server and the learner: docs/operations.md has all settings, ports agree, the pod is
+killed only after the server's grace period, and labels select the servers and the learners. Alerts must use metrics of
+docs/monitoring.md. promtool checks the rules and the configuration. Run the script from the repository's root. If there
+are faults, it prints them and ends with status 1.
 """
 
 import re
@@ -20,18 +21,18 @@ import yaml
 
 MANIFESTS = [Path("docker/kubernetes/servers.yaml"), Path("docker/kubernetes/learners.yaml")]
 PROMETHEUS = Path("docker/prometheus")
-# The oldest with a schema here, and the newest.
+# Default versions of Kubernetes: the oldest and the newest for which kubernetes-validate has a schema.
 VERSIONS = ["1.28.0", "1.37.0"]
 
 
 def read() -> dict[tuple[str, str], dict[str, Any]]:
-    """The documents of all manifests, by kind and name."""
+    """Reads the documents of all manifests. Returns them by kind and name."""
     documents = [document for path in MANIFESTS for document in yaml.safe_load_all(path.read_text())]
     return {(document["kind"], document["metadata"]["name"]): document for document in documents}
 
 
 def schema_faults(documents: dict, versions: list[str]) -> list[str]:
-    """Documents that a version of Kubernetes would refuse."""
+    """Returns a line for each document that one of `versions` of Kubernetes would refuse."""
     faults = []
     for version in versions:
         for (kind, name), document in documents.items():
@@ -44,12 +45,12 @@ def schema_faults(documents: dict, versions: list[str]) -> list[str]:
 
 
 def environment(container: dict) -> dict[str, str | None]:
-    """The variables of a container; those that Kubernetes fills in have no value here."""
+    """Returns a container's environment variables. The value is `None` if Kubernetes will compute it."""
     return {variable["name"]: variable.get("value") for variable in container.get("env", [])}
 
 
 def server_faults(documents: dict) -> list[str]:
-    """Statements about the server that are not true."""
+    """Returns a line for each part of the manifests that disagrees with the server's image or settings."""
     faults = []
     deployment = documents["Deployment", "perturb-servers"]["spec"]
     pod = deployment["template"]["spec"]
@@ -85,7 +86,7 @@ def server_faults(documents: dict) -> list[str]:
 
 
 def learner_faults(documents: dict) -> list[str]:
-    """Statements about learners that are not true."""
+    """Returns a line for each part of the learners' manifest that disagrees with the servers' manifest or the image."""
     job = documents["Job", "perturb-learners"]["spec"]
     (container,) = job["template"]["spec"]["containers"]
     arguments = container["args"]
@@ -104,7 +105,7 @@ def learner_faults(documents: dict) -> list[str]:
 
 
 def metric_faults() -> list[str]:
-    """Alerts about metrics that servers do not have."""
+    """Returns a line for each alert without advice in docs/clusters.md, and for each unknown metric in an alert."""
     known = set(re.findall(r"`((?:perturb|process)_[a-z_]+)`", Path("docs/monitoring.md").read_text()))
     rules = [
         rule for group in yaml.safe_load((PROMETHEUS / "alerts.yml").read_text())["groups"] for rule in group["rules"]
@@ -120,7 +121,10 @@ def metric_faults() -> list[str]:
 
 
 def promtool_faults() -> list[str]:
-    """Complaints of Prometheus itself. Debian's knows no Kubernetes, so its targets are replaced by a fixed one."""
+    """Returns promtool's complaints about the configuration of Prometheus.
+
+    Debian's promtool cannot discover targets in Kubernetes, so a fixed target replaces them.
+    """
     config = yaml.safe_load((PROMETHEUS / "kubernetes.yml").read_text())
     config["rule_files"] = [str((PROMETHEUS / name).resolve()) for name in config["rule_files"]]
     for job in config["scrape_configs"]:
@@ -134,7 +138,7 @@ def promtool_faults() -> list[str]:
 
 
 def main() -> None:
-    """Check everything."""
+    """Runs all checks, for the versions of Kubernetes in the arguments or else for `VERSIONS`."""
     versions = sys.argv[1:] or VERSIONS
     documents = read()
     faults = schema_faults(documents, versions)

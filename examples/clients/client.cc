@@ -21,20 +21,22 @@
 
 namespace pb = perturb::v1;
 
-// A session: a stream that owns a batch of environments. Dropping it frees them.
+// A session: a stream that owns a batch of environments. The destructor ends the stream, and the server then frees the
+// environments.
 class Session {
  public:
   Session(const std::string& address, const std::string& file) : replies_(file, std::ios::binary) {
     grpc::ChannelArguments arguments;
-    // Without this the library names a Unix socket's host by its path, which the server's HTTP/2 library refuses.
+    // By default gRPC sends a Unix socket's path as the host name, which the server's HTTP/2 library refuses.
     arguments.SetString(GRPC_ARG_DEFAULT_AUTHORITY, "localhost");
     arguments.SetMaxReceiveMessageSize(-1);  // the default of 4 MiB is too small for large batches
     stub_ = pb::Perturb::NewStub(grpc::CreateCustomChannel(address, grpc::InsecureChannelCredentials(), arguments));
     stream_ = stub_->Session(&context_);
   }
 
-  // Sends a request and waits for its reply, so that at most one is in flight. A client that writes many requests before
-  // it reads replies must write and read in two threads: flow control stops both sides otherwise.
+  // Sends a request and waits for its reply, so at most one request is in flight. A client that writes many requests
+  // before it reads their replies must write and read in two threads. In one thread it could block for ever, because
+  // flow control lets neither side write until the other side reads.
   pb::SessionResponse Call(const pb::SessionRequest& request) {
     pb::SessionResponse response;
     if (!stream_->Write(request) || !stream_->Read(&response)) {
@@ -46,7 +48,7 @@ class Session {
     return response;
   }
 
-  // Sends a request that must not be refused.
+  // Sends a request like `Call`, and throws an exception if the server refuses it.
   pb::SessionResponse Ask(const pb::SessionRequest& request) {
     pb::SessionResponse response = Call(request);
     if (response.has_error()) {
@@ -76,7 +78,8 @@ class Session {
   std::unique_ptr<grpc::ClientReaderWriter<pb::SessionRequest, pb::SessionResponse>> stream_;
 };
 
-// Arrays are little-endian like this processor. They may begin at any address, so they are copied.
+// Returns the numbers of an array. Arrays on the wire are little-endian, like this processor. The bytes may begin at an
+// unaligned address, so they are copied.
 template <typename Number>
 std::vector<Number> Read(const std::string& bytes) {
   std::vector<Number> numbers(bytes.size() / sizeof(Number));
@@ -100,7 +103,8 @@ pb::SessionRequest Open(const std::string& environment, pb::Version version, uin
   return request;
 }
 
-// Pushes each cart under its falling pole. An observation is position, velocity, angle, angular velocity.
+// Returns CartPole's actions, which push each cart under its falling pole. A row of `observations` has the cart's
+// position and velocity, and the pole's angle and angular velocity.
 std::string Balance(const std::string& observations) {
   const std::vector<float> rows = Read<float>(observations);
   std::vector<int32_t> actions;
@@ -108,7 +112,8 @@ std::string Balance(const std::string& observations) {
   return Write(actions);
 }
 
-// Turns each of Hopper's three joints back. The positions of the joints are the numbers 8, 10 and 12 of 15.
+// Returns Hopper's actions, which turn its three joints back to position 0. A row of `observations` has 15 numbers, and
+// the positions of the joints have the indices 8, 10 and 12.
 std::string Straighten(const std::string& observations) {
   const std::vector<float> rows = Read<float>(observations);
   std::vector<float> actions;
@@ -118,12 +123,12 @@ std::string Straighten(const std::string& observations) {
   return Write(actions);
 }
 
-// 256 CartPoles with parameters of E: 1000 steps.
+// Plays 256 CartPoles with parameters of version E for 1000 steps.
 void CartPole(Session& session) {
   pb::SessionRequest open = Open("CartPole", pb::VERSION_EXTREME, 256, 1);
   open.mutable_open()->set_receipts(true);
   const std::string first = session.Ask(open).opened().observations();
-  // A reset with as many equal seeds is what `open` did with that seed.
+  // A reset with the seed of `open` for each environment gives the first observations again.
   pb::SessionRequest reset;
   for (int slot = 0; slot < 256; ++slot) reset.mutable_reset()->add_seeds(1);
   std::string observations = session.Ask(reset).reset().observations();
@@ -131,7 +136,7 @@ void CartPole(Session& session) {
   for (int step = 0; step < 1000; ++step) observations = session.Step(Balance(observations)).observations();
 }
 
-// 16 Hoppers with parameters of R: 300 steps, with the terms of the reward.
+// Plays 16 Hoppers with parameters of version R for 300 steps, and requests the terms of the reward.
 void Hopper(Session& session) {
   pb::SessionRequest open = Open("Hopper", pb::VERSION_RANDOM, 16, 2);
   open.mutable_open()->set_autoreset_mode(pb::AUTORESET_MODE_NEXT_STEP);
@@ -140,7 +145,8 @@ void Hopper(Session& session) {
   for (int step = 0; step < 300; ++step) observations = session.Step(Straighten(observations)).observations();
 }
 
-// 8 CartPoles: saved, played on, restored, and played on again to the same observations. Then a refused step.
+// Saves 8 CartPoles after 20 steps, plays 50 steps, restores them, and plays 50 steps to the same observations. Then
+// sends a step that must be refused.
 void Snapshots(Session& session) {
   const pb::Opened opened = session.Ask(Open("CartPole", pb::VERSION_RANDOM, 8, 3)).opened();
   const std::string actions = Write(std::vector<int32_t>{0, 1, 0, 1, 0, 1, 0, 1});
@@ -163,10 +169,11 @@ void Snapshots(Session& session) {
   session.Step(actions);
 }
 
-// 8 CartPoles that the server plays with a policy: 500 steps, then 20 episodes.
+// Lets the server play 8 CartPoles with a policy: 500 steps, then 20 episodes.
 void Act(Session& session) {
   session.Ask(Open("CartPole", pb::VERSION_RANDOM, 8, 4));
-  std::vector<float> weights;  // of two networks with two hidden layers of 16: [16, 4], [16], [16, 16], [16], [n, 16], [n]
+  // Weights of the policy network (n = 2) and the value network (n = 1), each [16, 4], [16], [16, 16], [16], [n, 16], [n].
+  std::vector<float> weights;
   for (int i = 0; i < 2 * (80 + 272) + (2 + 1) * 17; ++i) weights.push_back(static_cast<float>(i * 37 % 17 - 8) / 16.0f);
   pb::SessionRequest act;
   act.mutable_act()->set_steps(500);
@@ -176,7 +183,7 @@ void Act(Session& session) {
   act.mutable_act()->mutable_policy()->mutable_training()->set_key(std::string(32, '\0'));
   while (!session.Ask(act).act().finished()) {
     act.Clear();
-    act.mutable_act();  // the rest of the task
+    act.mutable_act();  // continues the task
   }
   act.Clear();
   act.mutable_act()->set_episodes(20);

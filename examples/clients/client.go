@@ -25,16 +25,17 @@ import (
 	pb "perturb/v1"
 )
 
-// session is a stream that owns a batch of environments.
+// session is a stream that owns a batch of environments, with the file to which all replies are written.
 type session struct {
 	stream  pb.Perturb_SessionClient
 	replies *bufio.Writer
 }
 
-// call sends a request and waits for its reply, so that at most one is in flight. A client that sends many requests before
-// it receives replies must send and receive in two goroutines: flow control stops both sides otherwise.
+// call sends a request and waits for its reply, so at most one request is in flight. A client that sends many requests
+// before it receives their replies must send and receive in two goroutines. In one goroutine it could block for ever,
+// because flow control lets neither side send until the other side receives.
 func (s *session) call(request *pb.SessionRequest) (*pb.SessionResponse, error) {
-	// If the stream has ended, its status comes from Recv.
+	// If the stream has ended, Send returns io.EOF, and Recv returns the stream's status.
 	if err := s.stream.Send(request); err != nil && err != io.EOF {
 		return nil, err
 	}
@@ -50,7 +51,7 @@ func (s *session) call(request *pb.SessionRequest) (*pb.SessionResponse, error) 
 	return response, err
 }
 
-// ask sends a request that must not be refused.
+// ask sends a request like call, and returns an error if the server refuses it.
 func (s *session) ask(request *pb.SessionRequest) (*pb.SessionResponse, error) {
 	response, err := s.call(request)
 	if err == nil && response.GetError() != nil {
@@ -80,11 +81,12 @@ func floats(array []byte) []float32 {
 
 func array(numbers interface{}) []byte {
 	var buffer bytes.Buffer
-	binary.Write(&buffer, binary.LittleEndian, numbers) // a buffer takes everything
+	binary.Write(&buffer, binary.LittleEndian, numbers) // does not fail, because a buffer grows as needed
 	return buffer.Bytes()
 }
 
-// balance pushes each cart under its falling pole. An observation is position, velocity, angle, angular velocity.
+// balance returns CartPole's actions, which push each cart under its falling pole. A row of observations has the cart's
+// position and velocity, and the pole's angle and angular velocity.
 func balance(observations []byte) []byte {
 	rows := floats(observations)
 	var actions []int32
@@ -98,8 +100,8 @@ func balance(observations []byte) []byte {
 	return array(actions)
 }
 
-// straighten turns each of Hopper's three joints back. The positions of the joints are the numbers 8, 10 and 12
-// of 15.
+// straighten returns Hopper's actions, which turn its three joints back to position 0. A row of observations has 15
+// numbers, and the positions of the joints have the indices 8, 10 and 12.
 func straighten(observations []byte) []byte {
 	rows := floats(observations)
 	var actions []float32
@@ -111,7 +113,7 @@ func straighten(observations []byte) []byte {
 	return array(actions)
 }
 
-// cartPole plays 256 CartPoles with parameters of E: 1000 steps.
+// cartPole plays 256 CartPoles with parameters of version E for 1000 steps.
 func cartPole(s *session) error {
 	opened, err := s.open(&pb.Open{
 		Environment: "CartPole", Version: pb.Version_VERSION_EXTREME, BatchSize: 256, Seed: 1,
@@ -120,7 +122,7 @@ func cartPole(s *session) error {
 	if err != nil {
 		return err
 	}
-	// A reset with as many equal seeds is what `open` did with that seed.
+	// A reset with the seed of `open` for each environment gives the first observations again.
 	seeds := make([]uint64, 256)
 	for slot := range seeds {
 		seeds[slot] = 1
@@ -139,7 +141,7 @@ func cartPole(s *session) error {
 	return err
 }
 
-// hopper plays 16 Hoppers with parameters of R: 300 steps, with the terms of the reward.
+// hopper plays 16 Hoppers with parameters of version R for 300 steps, and requests the terms of the reward.
 func hopper(s *session) error {
 	opened, err := s.open(&pb.Open{
 		Environment: "Hopper", Version: pb.Version_VERSION_RANDOM, BatchSize: 16, Seed: 2,
@@ -152,7 +154,8 @@ func hopper(s *session) error {
 	return err
 }
 
-// snapshots saves 8 CartPoles, plays on, restores them, and plays on again to the same observations. Then a step is refused.
+// snapshots saves 8 CartPoles after 20 steps, plays 50 steps, restores them, and plays 50 steps to the same
+// observations. Then it sends a step that must be refused.
 func snapshots(s *session) error {
 	if _, err := s.open(&pb.Open{
 		Environment: "CartPole", Version: pb.Version_VERSION_RANDOM, BatchSize: 8, Seed: 3,
@@ -204,7 +207,7 @@ func snapshots(s *session) error {
 	return err
 }
 
-// act has the server play 8 CartPoles with a policy: 500 steps, then 20 episodes.
+// act lets the server play 8 CartPoles with a policy: 500 steps, then 20 episodes.
 func act(s *session) error {
 	if _, err := s.open(&pb.Open{
 		Environment: "CartPole", Version: pb.Version_VERSION_RANDOM, BatchSize: 8, Seed: 4,
@@ -218,10 +221,11 @@ func act(s *session) error {
 			if err != nil || response.GetAct().GetFinished() {
 				return err
 			}
-			request = &pb.Act{} // the rest of the task
+			request = &pb.Act{} // continues the task
 		}
 	}
-	var weights []float32 // of two networks with two hidden layers of 16: [16, 4], [16], [16, 16], [16], [n, 16], [n]
+	// Weights of the policy network (n = 2) and the value network (n = 1), each [16, 4], [16], [16, 16], [16], [n, 16], [n].
+	var weights []float32
 	for i := 0; i < 2*(80+272)+(2+1)*17; i++ {
 		weights = append(weights, float32(i*37%17-8)/16)
 	}
@@ -253,7 +257,7 @@ func run(address, scenario, file string) (err error) {
 	connection, err := grpc.Dial(
 		address,
 		grpc.WithInsecure(),
-		// Without this the library may name a Unix socket's host by its path, which the server's HTTP/2 library refuses.
+		// By default gRPC may send a Unix socket's path as the host name, which the server's HTTP/2 library refuses.
 		grpc.WithAuthority("localhost"),
 		// The default of 4 MiB is too small for large batches.
 		grpc.WithDefaultCallOptions(grpc.MaxCallRecvMsgSize(math.MaxInt32)),

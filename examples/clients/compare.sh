@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
-# compare.sh PROGRAMS BUILD: builds the clients in C++ and Go in BUILD, plays every scenario with them and with the Rust
-# client on one server, and compares the replies byte for byte. PROGRAMS has perturb-server, and in examples/ the Rust client.
-# Run from the repository's root, with Debian's packages of `make languages-test`.
+# compare.sh PROGRAMS BUILD: builds the clients in C++ and Go in the folder BUILD. Plays every scenario on one server
+# with these clients and with the Rust client, and compares the replies byte for byte. PROGRAMS contains perturb-server,
+# and the Rust client as examples/client. Run the script from the repository's root. It needs the Debian packages that
+# `make languages-test` installs.
 set -euo pipefail
 
 programs=$(realpath "$1")
