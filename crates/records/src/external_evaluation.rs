@@ -60,8 +60,8 @@ pub struct ExternalPolicy {
 /// Metadata of an external policy that its records do not contain.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyMetadata {
-    /// The version whose parameters the policy was trained on. `None` if unknown, or if it was trained on other
-    /// parameters.
+    /// The version (parameter distribution D, R, E or R+E) on which the policy was trained. `None` if unknown, or if the
+    /// policy was trained on other parameters.
     pub trained_on: Option<Version>,
     /// Number of training steps, summed over all environments; `None` if unknown.
     pub timesteps: Option<u64>,
@@ -120,7 +120,7 @@ pub enum ExternalEvaluationError {
     /// The policies are of different environments, or two have the same training distribution.
     #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
-        /// The condition that is violated.
+        /// A clause that says what the policies have in place of this, e.g. "they are of CartPole and Pendulum".
         got: String,
     },
     /// The folder to write to is not empty.
@@ -313,12 +313,12 @@ impl ExternalEvaluation {
     }
 }
 
-/// Returns the names of the records files that the document `json` lists. Returns none if the document is missing or
-/// cannot be parsed.
+/// Returns the names of the records files that the document `json` lists. Returns an empty set if the document is missing
+/// or cannot be parsed.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let text = read_if_there(json)?.unwrap_or_default();
     let mut value = serde_json::from_slice(&text).unwrap_or_default();
-    // A document with a wrong checksum can still be parsed for its files.
+    // Ignores a wrong checksum, because only the names of the files are needed.
     let _ = checksum::open(&mut value);
     let entries =
         serde_json::from_value(value).map_or_else(|_| Vec::new(), |document: EvaluationDocument| document.policies);

@@ -47,7 +47,8 @@ impl HeatmapOptions {
     }
 }
 
-/// The parameters of a heatmap and the version of its other parameters. Only heatmaps of the same kind can be compared.
+/// The parameters along the axes of a heatmap, and the version (distribution) from which the other parameters are drawn. Only
+/// heatmaps of the same kind can be compared.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct HeatmapKind {
     /// The names of the parameters along x and along y.
@@ -56,8 +57,8 @@ pub struct HeatmapKind {
     pub base: Version,
 }
 
-/// The mean return and success rate of a policy at each point of a grid of two parameters, or the averages of several
-/// policies there.
+/// The mean return and success rate at each point of a grid of two parameters: of one policy, or averaged over several
+/// policies.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Heatmap {
     /// The environment's name in the catalogue.
@@ -90,7 +91,7 @@ pub struct HeatmapPoint {
 }
 
 impl HeatmapOptions {
-    /// Returns the parameters and the version of the heatmap.
+    /// Returns the kind of the heatmap: its two parameters, and the version from which the others are drawn.
     pub fn kind(&self) -> HeatmapKind {
         HeatmapKind { parameters: self.parameters.clone(), base: self.base }
     }
@@ -114,7 +115,8 @@ impl Heatmap {
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
-        // Collects the parameters that vary. The faster one already differs between the first two contexts.
+        // Collects the parameters that vary. The parameter along x varies faster: it already differs between the first two
+        // contexts.
         let (mut varying, mut faster) = (Vec::new(), None);
         for parameter in environment.parameters.iter().filter(|_| set.name == Self::SET) {
             let value = |context: &Context| context.get(&parameter.name).copied();
@@ -152,8 +154,8 @@ impl Heatmap {
         HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
     }
 
-    /// Returns the version of the other parameters in a recorded heatmap. Returns `None` if the records contain no test
-    /// of a heatmap.
+    /// Returns the version from which the parameters that are not axes were drawn in a recorded heatmap. Returns `None` if
+    /// the records contain no test of a heatmap.
     pub fn base_of(records: &Records) -> Option<Version> {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }

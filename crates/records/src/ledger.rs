@@ -17,34 +17,36 @@ use perturb_settings::Common;
 
 use crate::records::{RecordedTest, Records};
 
-/// The ledgers of one or several servers, with valid digest chains.
+/// The ledgers of one or several servers. Each line of a ledger has a digest that depends on all lines before it, and all
+/// digests were verified.
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
     /// The parameter draws of each environment.
     drawn: Vec<Drawn>,
-    /// The environments of each session, seed and environment index.
+    /// The state of the environments with the same session, seed and environment index.
     at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
     refused: Vec<Refused>,
     /// The end of each server process; `None` if it is unknown.
     over: Vec<Option<Moment>>,
-    /// The index and description of a line that contradicts itself.
+    /// The index of the first contradictory line, and a description of the contradiction.
     defect: Option<(u64, &'static str)>,
 }
 
-/// The draws of all environments with the same seed and environment index in a session.
+/// The environments of a session that have the same seed and environment index. There are several if, for
+/// example, trainings with the same seed share the session.
 #[derive(Debug, Default)]
 struct EnvironmentAddress {
     /// Indices in `drawn` of environments that are still in use.
     open: Vec<usize>,
-    /// Recorded ends that are not yet assigned to environments. They are assigned when there is one for each
-    /// environment in `open`.
+    /// Recorded ends that are not yet assigned to environments. They are assigned when there are as many ends as
+    /// environments in `open`.
     ends: Vec<(Option<u64>, Moment)>,
     /// Indices in `drawn` of the environments that ended last.
     closed: Vec<usize>,
 }
 
-/// Maximal number of environments in a line.
+/// Maximum number of environments in a ledger's line. A line with more is refused.
 const MAX_ENVS: u32 = 1 << 22;
 
 /// The last line of a ledger.
@@ -70,14 +72,14 @@ pub struct Proof {
     pub sessions: usize,
     /// Descriptions of findings against the policy.
     pub against: Vec<String>,
-    /// Descriptions of requests by these tokens that the servers refused before the training ended.
+    /// Descriptions of requests with the training's tokens that the servers refused before the training ended.
     pub refused: Vec<String>,
 }
 
 /// Identifies a session: the index of the server process in the ledgers, and the session's number in this process.
 type SessionId = (usize, u64);
 
-/// The position, session and author of a line.
+/// The position of a ledger's line, and the session that caused it.
 #[derive(Debug, Clone)]
 struct LedgerLine {
     at: Moment,
@@ -85,7 +87,7 @@ struct LedgerLine {
     who: LedgerSession,
 }
 
-/// The time of a line. Lines of one ledger are ordered by their number `n`, lines of different ledgers by the clock.
+/// The time of a line. Lines of one ledger are ordered by their number `n`, and lines of different ledgers by `unix_ms`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Moment {
     ledger: usize,
@@ -131,8 +133,8 @@ struct Refused {
 }
 
 impl Ledgers {
-    /// Reads ledgers and checks their digest chains. `known` are digests noted earlier, each of which must occur in a
-    /// ledger.
+    /// Reads ledgers and checks their digest chains. `known` are digests of lines that the user noted earlier. Each of
+    /// them must occur in a ledger, otherwise the ledger was rewritten.
     ///
     /// # Errors
     /// A description of the first ledger that cannot be read or is not valid.
@@ -181,7 +183,7 @@ impl Ledgers {
         let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
-                // The earlier server process of the same ledger ended before this line.
+                // A server process started. The process that wrote to the same ledger before must have ended by now.
                 if n > 0
                     && let Some(over) = self.over.last_mut()
                 {
@@ -197,7 +199,8 @@ impl Ledgers {
         }
     }
 
-    /// Stores a record of draws. The environments in `ends` stopped drawing before those in `begins` began.
+    /// Stores a record of draws. Handles `ends` first, because the environments in `ends` stopped drawing before the
+    /// environments in `begins` started.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {
@@ -223,12 +226,13 @@ impl Ledgers {
         }
     }
 
-    /// Records that an environment stopped drawing. `end` is its last episode, if it had any, and the time.
+    /// Records that an environment stopped drawing. `end` has the environment's last episode and the time. The episode is
+    /// `None` if nothing was drawn.
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
-        // If no environment was in use, this end belongs to the environments that ended last: they had continued to
-        // draw.
+        // If no environment is in use, `end` corrects the previous ends: the environments that ended last had drawn more
+        // episodes.
         let continued = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
@@ -249,7 +253,7 @@ impl Ledgers {
         }
     }
 
-    /// Audits a policy with its recorded tests. It was trained for `episodes` episodes in `environment` with the
+    /// Audits a policy with its recorded tests. The policy was trained for `episodes` episodes in `environment` with the
     /// settings `training`.
     pub fn prove(
         &self,
@@ -259,7 +263,7 @@ impl Ledgers {
         records: &Records,
     ) -> Proof {
         let claimed = Region::from_version(environment, training.version, &training.parameters);
-        // A training with the same seed but other parameters is a different one.
+        // A training with the same seed but another parameter distribution is a different training.
         let is_own = |drawn: &&Drawn| {
             drawn.line.who.environment == environment.name
                 && drawn.last != LastDraw::None
@@ -281,21 +285,22 @@ impl Ledgers {
                 format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
             proof.against.push(few);
         }
-        // If the end of a session is not recorded, it counts until the end of its server process.
+        // If the end of an environment's draws is not recorded, the training may have lasted until its server process
+        // ended.
         let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
         let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
-        let is_its = |line: &LedgerLine| {
+        let is_by_owner = |line: &LedgerLine| {
             line.who.environment == environment.name
                 && proof.tokens.contains(&line.who.token)
                 && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
         };
-        // Looks for draws of these tokens from the test sets before the training ended.
+        // Looks for draws from the test sets with the training's tokens before the training ended.
         for test in &records.about.tests {
             let set = &test.set.name;
             let others = tested(environment, test, &claimed);
             let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
             let mut reported: Option<Moment> = None;
-            for drawn in self.drawn.iter().filter(|drawn| drawn.last != LastDraw::None && is_its(&drawn.line)) {
+            for drawn in self.drawn.iter().filter(|drawn| drawn.last != LastDraw::None && is_by_owner(&drawn.line)) {
                 let what = if reported == Some(drawn.line.at) {
                     continue;
                 } else if drawn.has_episode(test, records) {
@@ -310,7 +315,7 @@ impl Ledgers {
                 reported = Some(drawn.line.at);
             }
         }
-        let refused = self.refused.iter().filter(|refused| is_its(&refused.line));
+        let refused = self.refused.iter().filter(|refused| is_by_owner(&refused.line));
         let refused =
             refused.map(|Refused { line, region, reason }| self.sentence(line, &format!("{region} refused: {reason}")));
         proof.refused = refused.collect();
@@ -352,8 +357,8 @@ impl Drawn {
             LastDraw::Episode(last) => (self.first..=last).contains(&episode),
             LastDraw::Unknown => self.first <= episode,
         };
-        let its = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == test.seed);
+        let recorded = records.episodes.iter().filter(|record| record.set == test.set.name && record.seed == test.seed);
         self.seed == test.seed
-            && its.filter(|record| record.environment_index == self.index).any(|record| may(record.episode_index))
+            && recorded.filter(|record| record.environment_index == self.index).any(|record| may(record.episode_index))
     }
 }

@@ -6,7 +6,7 @@ use serde::Deserialize;
 use crate::scenarios::Metric;
 use crate::statistics::Summary;
 
-/// Every number in the paper's tables.
+/// All numbers of the paper's tables, as CSV.
 const TABLE: &str = include_str!("../data/paper_results.csv");
 /// The paper's environments, by their names in the catalogue.
 pub const ENVIRONMENTS: [&str; 6] = ["CartPole", "MountainCar", "Acrobot", "Pendulum", "HalfCheetah", "Hopper"];
@@ -42,7 +42,7 @@ impl Record {
     }
 }
 
-/// Returns the paper's number for a method in an environment; `None` if it has none. For the average over all six
+/// Returns the paper's number for a method in an environment; `None` if the paper has none. For the average over all six
 /// environments, pass "Average" as `environment`.
 pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summary> {
     let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
@@ -68,8 +68,8 @@ pub fn methods(environment: &str) -> Vec<Method> {
     methods
 }
 
-/// Returns the paper's average over `environments`. For all six this is the published average, otherwise the mean of
-/// the published numbers.
+/// Returns the paper's average of a metric over `environments`. For all six environments this is the published average,
+/// otherwise the mean of the published numbers. Returns `None` if a number is missing.
 pub fn average(environments: &[&str], method: &Method, metric: Metric) -> Option<Summary> {
     let means: Option<Vec<f64>> = environments.iter().map(|name| Some(number(name, method, metric)?.mean)).collect();
     let means = means?;
@@ -151,7 +151,7 @@ mod tests {
             let method = Method { algorithm, architecture, episodes_per_trial, preset, observe, external: false };
             let means = ENVIRONMENTS.map(|environment| number(environment, &method, metric).unwrap().mean);
             let mean = means.iter().sum::<f64>() / means.len() as f64;
-            // Both numbers are rounded to 0.01, so each may be off by half of it. The rest of the tolerance is for
+            // Both numbers are rounded to 0.01, so each may be off by 0.005. The rest of the tolerance is for
             // binary rounding.
             assert!((mean - mean_percent).abs() < 0.0101, "{method} {metric}: {mean} is not {mean_percent}");
         }

@@ -24,7 +24,8 @@ use perturb_files::{AnyError, checksum};
 const KEY: &str = "perturb";
 /// The bytes with which every Parquet file begins and ends.
 const MAGIC: &[u8] = b"PAR1";
-/// Maximum size of a column's dictionary, in bytes. Beyond it, texts are written in full in every row.
+/// Maximum size of a column's dictionary of distinct texts, in bytes. When the dictionary is full, the following rows
+/// contain their whole text instead of an index into the dictionary.
 const MAX_DICTIONARY_BYTES: usize = 8 << 20;
 
 /// The values of a column, one for each row.
@@ -97,7 +98,7 @@ impl ColumnValues<'_> {
         }
     }
 
-    /// Writes the values of `rows`.
+    /// Writes the values of the range `rows`. Returns the number of values that are not missing.
     fn write(&self, rows: Range<usize>, writer: &mut SerializedColumnWriter<'_>) -> Result<usize, ParquetError> {
         match self {
             Self::Text(texts) => {
@@ -134,7 +135,7 @@ impl ColumnValues<'_> {
     }
 }
 
-/// Returns 1 for each row with a value and 0 for each row without, which Parquet calls definition levels.
+/// Returns Parquet's definition levels: 1 for each row with a value, and 0 for each row without a value.
 fn levels<T>(values: &[Option<T>]) -> Vec<i16> {
     values.iter().map(|value| value.is_some().into()).collect()
 }
@@ -262,7 +263,7 @@ impl RowGroup<'_> {
         self.group.metadata().columns().iter().position(|column| column.column_descr().name() == name)
     }
 
-    /// Reads column number `place`, in which rows may lack a value.
+    /// Reads the column with index `place`, in which rows may lack a value.
     fn values<T: DataType>(&self, place: usize) -> Result<Vec<Option<T::T>>, AnyError> {
         let column = self.group.metadata().column(place).column_descr();
         let (name, is_optional) = (column.name().to_owned(), column.max_def_level() > 0);
@@ -286,7 +287,7 @@ impl RowGroup<'_> {
         Ok(there.into_iter().map(|there| if there == 1 { values.next() } else { None }).collect())
     }
 
-    /// Reads column number `place`, in which every row must have a value.
+    /// Reads the column with index `place`, in which every row must have a value.
     fn all<T: DataType>(&self, place: usize) -> Result<Vec<T::T>, AnyError> {
         let values: Option<Vec<T::T>> = self.values::<T>(place)?.into_iter().collect();
         values.ok_or_else(|| "a row has no value in a required column".into())

@@ -89,7 +89,7 @@ impl Metric {
     /// All metrics, in the paper's order.
     pub const ALL: [Metric; 3] = [Metric::Default, Metric::Interpolation, Metric::Extrapolation];
 
-    /// The scenarios whose geometric mean is Extrapolation.
+    /// The scenarios of the metric Extrapolation, which is the geometric mean of their success rates.
     pub const EXTRAPOLATION: [Scenario; 3] = [
         Scenario { train: Version::D, test: Version::R },
         Scenario { train: Version::D, test: Version::E },

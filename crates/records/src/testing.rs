@@ -42,11 +42,12 @@ pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
 }
 
 /// Returns for each environment `[N]` the number of its trials that count. Environment i has context i modulo
-/// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes`.
+/// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes` episodes.
 /// `contexts` must be at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
-    // One context gets as many environments as it can use. Several contexts divide the environments equally.
+    // The 100 environments are divided equally among the contexts. A context gets at least one environment, and at most
+    // one for each episode.
     let copies = ((MAX_ENVS / contexts) as u64).clamp(1, each);
     (0..copies).flat_map(|i| vec![each / copies + u64::from(i < each % copies); contexts]).collect()
 }
@@ -80,7 +81,8 @@ impl TestCollector {
         self.quotas.len()
     }
 
-    /// Adds episodes that have just ended. Ignores episodes that do not count.
+    /// Adds episodes that have just ended. Ignores all but the last episode of a trial, and trials beyond the number that
+    /// counts in their environment.
     pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
         let Self { quotas, episodes_per_trial, .. } = self;
         let counts = |end: &EndedEpisode| {
@@ -90,7 +92,7 @@ impl TestCollector {
         self.counted.extend(ended.into_iter().filter(counts));
     }
 
-    /// Returns the number of episodes so far, and the number to be collected.
+    /// Returns the number of episodes collected so far, and the number of episodes to collect.
     pub fn progress(&self) -> (u64, u64) {
         // The sum saturates. An overflow would end a test of very many episodes before its first episode.
         (self.counted.len() as u64, self.quotas.iter().fold(0, |sum, &quota| sum.saturating_add(quota)))
@@ -121,8 +123,8 @@ impl TestCollector {
     }
 }
 
-/// Returns the permitted values of each parameter in one context of a set, for each alternative. Version R+E has two
-/// alternatives, because all parameters of a trial are from R or all are from E; other versions have one.
+/// Returns the permitted values of all parameters in one context of a set, `[alternatives][parameters]`. Version R+E has
+/// two alternatives, because a trial draws either all parameters from R or all from E. Other versions have one.
 fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {

@@ -7,8 +7,8 @@ use perturb_settings::{ValueError, require};
 use super::ComparedCondition;
 use crate::records::{Records, RecordsMetadata};
 
-/// Refuses conditions without policies, the same name twice and an unknown baseline. `conditions` are names and numbers of
-/// policies.
+/// Refuses a condition without policies, two conditions with the same name, and an unknown baseline. `conditions` has the
+/// name and the number of policies of each condition.
 pub(super) fn names(conditions: &[(&str, usize)], baseline: Option<&str>) -> Result<(), ValueError> {
     require(!conditions.is_empty(), "a comparison", "of nothing", "of at least one condition")?;
     let mut names = BTreeSet::new();
@@ -27,12 +27,12 @@ pub(super) fn names(conditions: &[(&str, usize)], baseline: Option<&str>) -> Res
     require(is_known, "the baseline", format!("`{baseline}`"), format!("one of {expected}"))
 }
 
-/// Refuses an empty list of sets.
+/// Refuses an empty list of test sets.
 pub(super) fn sets(sets: &[String]) -> Result<(), ValueError> {
     require(!sets.is_empty(), "a comparison", "without tests", "in tests that all conditions have")
 }
 
-/// Refuses policies of different environments, success rules or sets.
+/// Refuses policies that differ in environment, success rule, or the parameters of a test set.
 pub(super) fn records(conditions: &[ComparedCondition<'_>], sets: &[String]) -> Result<(), ValueError> {
     self::sets(sets)?;
     // All policies must have the environment, the success rule and the sets of the first policy.

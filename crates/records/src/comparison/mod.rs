@@ -26,7 +26,7 @@ pub struct ComparedCondition<'a> {
     pub policies: Vec<(String, &'a Records)>,
 }
 
-/// The quantity of an episode whose means are compared.
+/// A quantity of an episode. Conditions are compared by its mean over episodes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum ComparedScore {
@@ -134,7 +134,7 @@ pub fn compare(
     Ok(compared(sets, score, baseline, |set| conditions.iter().map(|it| condition_tested_on(it, set, score)).collect()))
 }
 
-/// Compares the conditions that `tested` returns for each of `sets`.
+/// Compares conditions on each test set of `sets`. `tested` returns the scores of all conditions on a test set.
 fn compared<'a>(
     sets: &[String],
     score: ComparedScore,
@@ -151,7 +151,7 @@ fn compared<'a>(
         };
         differences.extend(pairs.into_iter().map(|[x, y]| difference(&tested[x], &tested[y], set)));
     }
-    // Holm's correction, for all differences that have a p-value.
+    // Applies Holm's correction for multiple comparisons to all p-values.
     let known: Vec<f64> = differences.iter().filter_map(|it| it.p).collect();
     let mut corrected = holm(&known).into_iter();
     for it in &mut differences {
@@ -243,14 +243,15 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     let [of_x, of_y] = [x.by_seed(), y.by_seed()];
     let pairs = pairs(&x.keys, &y.keys);
     let by_seed: Vec<f64> = pairs.iter().flatten().map(|&[x, y]| of_x[x] - of_y[y]).collect();
-    // Without pairs, the two groups are the scores of x and the negated scores of y. Their mean is half of the
-    // difference, so the difference's interval is twice theirs.
+    // Without pairs, the strata are the scores of x and the negated scores of y. The mean over these two strata is half
+    // of the difference between x and y, so the ends of its interval are multiplied by 2.
     let (strata, scale) = match pairs {
         Some(_) => (vec![by_seed.clone()], 1.0),
         None => (vec![of_x.clone(), of_y.iter().map(|score| -score).collect()], 2.0),
     };
     let interval = mean_with_t_interval(&strata).and_then(|it| it.interval_95);
-    // Over episodes: a t interval of the differences if both played the same episodes, else a normal interval.
+    // The interval over episodes: a t interval of the differences in each episode if all policies played the same
+    // episodes, else an interval by the normal approximation.
     let all: Vec<TestScores> = x.policies.iter().chain(&y.policies).cloned().collect();
     let same_episodes = share_episodes(&all);
     let difference = mean(of_x.iter().copied()) - mean(of_y.iter().copied());
@@ -282,8 +283,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     }
 }
 
-/// Returns pairs of indices into `x` and `y` that have the same key, in the order of `x`. Returns `None` unless both
-/// have the same keys, each only once.
+/// Returns the pairs of equal keys, as an index into `x` and an index into `y`, in the order of `x`. Returns `None` unless
+/// `x` and `y` have the same keys, each only once.
 fn pairs(x: &[String], y: &[String]) -> Option<Vec<[usize; 2]>> {
     let distinct: std::collections::BTreeSet<&String> = x.iter().collect();
     if x.len() != y.len() || distinct.len() != x.len() {

@@ -11,9 +11,9 @@ type EpisodeAddress = (u64, u32, u64);
 /// The scores of a policy in one test.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct TestScores {
-    /// The address of each episode, in their order; empty if the addresses are not known.
+    /// The address of each episode, in recorded order; empty if the addresses are not known.
     addresses: Vec<EpisodeAddress>,
-    /// The score of each episode, in recorded order; empty if only their mean is known.
+    /// The score of each episode, in recorded order; empty if only the mean score is known.
     pub(super) values: Vec<f64>,
     /// The mean score.
     pub(super) mean: f64,
@@ -38,8 +38,8 @@ impl TestScores {
         }
     }
 
-    /// Returns the scores of a row of a results table. Successes are known by their number, returns and lengths by their
-    /// mean. `None` for a failed cell.
+    /// Returns the scores of a row of a results table. A row has the number of successes, so their scores are listed. Of
+    /// returns and lengths it has only the mean. Returns `None` for a failed cell.
     pub(super) fn of_row(row: &TableRow, score: ComparedScore) -> Option<Self> {
         let result = row.result()?;
         let (episodes, successes) = (usize::try_from(row.episodes?).ok()?, usize::try_from(row.successes?).ok()?);

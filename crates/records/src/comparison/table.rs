@@ -1,4 +1,4 @@
-//! Conditions of rows of a results table.
+//! Comparison of conditions whose tests are rows of a results table.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -9,28 +9,34 @@ use super::scores::TestScores;
 use super::{ComparedScore, ConditionComparison, TestedCondition, check, compared};
 use crate::results_table::{SELECTION_TEST, TableRow};
 
-/// A condition of rows of a results table. Its policies are the cells of these rows, and differ by their seeds.
+/// A condition whose tests are rows of a results table. Each cell (training) of these rows is a policy of the condition.
+/// The policies differ only in their seed.
 #[derive(Clone, Debug)]
 pub struct TableCondition<'a> {
-    /// The name, free but distinct.
+    /// The condition's name. It is freely chosen, but no two conditions may have the same name.
     pub name: String,
-    /// The rows. Those of failed cells, of selecting tests and of intermediate policies before the last one are left out.
+    /// The rows. The comparison ignores rows of failed cells, of tests that select a configuration, and of policies from
+    /// before the end of their training.
     pub rows: Vec<&'a TableRow>,
 }
 
-/// A test of a final policy.
+/// A test of a policy at the end of its training.
 #[derive(Clone, Copy)]
 struct RowTest<'a> {
     set: &'a str,
     row: &'a TableRow,
 }
 
-/// Compares conditions of rows in the tests on `sets`: every pair of conditions, or each condition with `baseline`. `None`
-/// means the sets that all policies have. Sets that only a study names are among them if all rows are of one study.
+/// Compares the scores of conditions in the tests on `sets`. With a `baseline`, compares every other condition with the
+/// condition of this name. Otherwise compares every pair of conditions.
+///
+/// If `sets` is `None`, compares on every test set that all policies were tested on. If the rows are from several studies,
+/// only versions count, because two studies may call different sets by the same name.
 ///
 /// # Errors
-/// [`ValueError`] for conditions without results or with the same name, several policies of a condition with the same seed,
-/// several environments, a set without results, and an unknown baseline.
+/// [`ValueError`] if a condition has no results, two conditions have the same name, or two policies of a condition have the
+/// same seed. Also if rows are of several environments or models, a policy was not tested on a set of `sets`, or the baseline is
+/// unknown.
 pub fn compare_rows(
     conditions: &[TableCondition<'_>],
     sets: Option<&[String]>,
@@ -61,7 +67,7 @@ pub fn compare_rows(
     Ok(ConditionComparison { from_counts: true, ..compared(&sets, score, baseline, tested) })
 }
 
-/// Returns the tests of the final policies of a condition, each once.
+/// Returns a condition's tests of final policies. If a cell was tested several times on a set, takes its last test.
 fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
     let mut places: BTreeMap<(&str, &str, &str), usize> = BTreeMap::new();
     let mut found: Vec<RowTest<'a>> = Vec::new();
@@ -71,7 +77,8 @@ fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
         match found.get_mut(place) {
             Some(test) if row.after_episodes > test.row.after_episodes => *test = RowTest { set, row },
             Some(test) if row.after_episodes < test.row.after_episodes => {}
-            // A second policy of this cell, as in another table, is refused later.
+            // Two rows for the same test, for example from two tables, are both taken. `one_policy_for_each_seed` refuses
+            // them.
             _ => found.push(RowTest { set, row }),
         }
     }
@@ -102,7 +109,7 @@ fn one_policy_for_each_seed(condition: &str, tests: &[RowTest<'_>]) -> Result<()
     Ok(())
 }
 
-/// Returns the names of settings by which two policies differ, or `study` for repetitions in another one.
+/// Returns the names of the settings in which two policies differ. If all settings are equal, returns `study`.
 fn differing_columns(one: &TableRow, other: &TableRow) -> Vec<String> {
     let settings = |row: &TableRow| -> BTreeMap<String, serde_json::Value> {
         serde_json::from_str(&row.settings).unwrap_or_default()
@@ -117,8 +124,9 @@ fn differing_columns(one: &TableRow, other: &TableRow) -> Vec<String> {
     if names.is_empty() { vec!["study".into()] } else { names }
 }
 
-/// Returns the sets that every policy was tested on: versions, then sets in the order of the first condition. Two studies
-/// may call different sets by the same name, so that only versions are common to them.
+/// Returns the sets that every policy was tested on: first versions, then other sets in the order of the first condition.
+/// If the tests are from several studies, returns only versions, because two studies may call different sets by the same
+/// name.
 fn common_sets(tests: &[Vec<RowTest<'_>>]) -> Vec<String> {
     let studies: BTreeSet<&str> = tests.iter().flatten().map(|test| test.row.study.as_str()).collect();
     let is_comparable = |set: &str| studies.len() == 1 || set.parse::<Version>().is_ok();

@@ -6,7 +6,7 @@ use crate::fixture::{assessed, episode};
 use crate::records::Records;
 use crate::results_table::{SELECTION_TEST, TableRow};
 
-/// Returns records of a policy's tests on D and R. Each test has an episode for each of these returns; a return of at
+/// Returns records of a policy's tests on D and R. Each test has an episode for each element of `returns`. A return of at
 /// least 5 is a success.
 fn policy(returns: &[u32]) -> Records {
     let mut records = assessed("agent", "CartPole", &[Some(Version::D)], [1, 1, 1]).policies()[0].records.clone();
@@ -104,7 +104,7 @@ fn success_rates_have_wilsons_interval_over_episodes() {
     let all = [policy(&[9; 4])];
     let [low, high] = compared(&all, &all, ComparedScore::Success).means[0].episodes_95.unwrap();
     assert!(low < 60.0 && high == 100.0, "{low}");
-    // An interval over seeds ends where success rates end.
+    // An interval over seeds is clamped to the range of success rates, 0 to 100 %.
     let seeds = [policy(&[9; 4]), policy(&[1; 4]), policy(&[9; 4])];
     let over_seeds = compared(&seeds, &seeds, ComparedScore::Success).means[0].seeds_95;
     assert_eq!(over_seeds, Some([0.0, 100.0]));
@@ -151,7 +151,7 @@ fn rows<'a>(name: &str, rows: &'a [TableRow]) -> TableCondition<'a> {
 
 #[test]
 fn rows_of_a_table_give_the_numbers_of_episodes() {
-    // The same counts as episodes, in other episodes for each policy.
+    // Recorded episodes with the same numbers of successes as the rows. Each policy plays different episodes.
     let counts = [[30, 60, 90], [20, 40, 90]];
     let policy = |seed: u64, successes: u64| {
         let steps: Vec<u32> = (0..100).map(|episode| if episode < successes { 9 } else { 1 }).collect();

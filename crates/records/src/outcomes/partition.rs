@@ -2,14 +2,15 @@
 
 use super::Outcomes;
 
-/// Intended number of episodes in a region. Half of them estimate the region's success rate, in steps of 1/20.
+/// Intended number of episodes in a region. Half of them, 20 episodes, estimate the region's success rate. The estimate is
+/// then a multiple of 1/20.
 const EPISODES: f64 = 40.0;
 
 impl Outcomes {
     /// Returns the region of the parameter space to which each episode belongs, numbered from 0. If the test set is a
     /// list of contexts, each context is a region. Otherwise the range of each varying parameter is divided at
-    /// quantiles of its own values. The number of intervals is chosen to give about 40 episodes in each region. The
-    /// outcomes of the episodes have no influence on the division.
+    /// quantiles of its own values. Every parameter is divided into the same number of intervals, chosen to give about
+    /// 40 episodes in each region. The outcomes of the episodes have no influence on the division.
     pub fn parts(&self) -> Vec<usize> {
         if let Some(contexts) = &self.contexts {
             return contexts.clone();

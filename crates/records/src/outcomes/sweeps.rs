@@ -51,7 +51,7 @@ impl std::iter::Sum for Counted {
     }
 }
 
-/// Divides the range of parameter number `place` in `tests` into about ten equal bins. A gap wider than a tenth of the
+/// Divides the range of the parameter with index `place` in `tests` into about ten equal bins. A gap wider than a tenth of the
 /// range belongs to no bin; version E (extreme) has such a gap between its two intervals. Returns no bins if the
 /// parameter does not vary.
 pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
@@ -74,7 +74,7 @@ pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<
     values.chunk_by(|a, b| b - a < width).flat_map(of_interval).collect()
 }
 
-/// Counts the episodes and successes of `outcomes` in each of the `bins` of parameter number `place`.
+/// Counts the episodes and successes of `outcomes` in each of the `bins` of the parameter with index `place`.
 pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
@@ -87,8 +87,8 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Co
     counted
 }
 
-/// Counts the episodes and successes of `outcomes` for each pair of bins of two parameters, numbers `x` and `y`.
-/// Returns the counts `[Y, X]` as one array. It is empty if one of the parameters does not vary.
+/// Counts the episodes and successes of `outcomes` for each pair of bins of the two parameters with the indices `x` and `y`.
+/// Returns the counts `[Y, X]` as one array. The array is empty if one of the parameters does not vary.
 pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
     let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
     let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();

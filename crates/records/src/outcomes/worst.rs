@@ -18,7 +18,7 @@ pub fn conditional_value_at_risk(returns: &[f64], share: f64) -> f64 {
     worst.iter().sum::<f64>() / worst.len() as f64
 }
 
-/// The successes and episodes of a region, in each half of its episodes.
+/// The numbers of successes and of episodes of a region. The region's episodes are divided into two halves, 0 and 1.
 #[derive(Clone, Copy, Default)]
 struct ContextGroup {
     successes: [f64; 2],
@@ -42,7 +42,8 @@ impl ContextGroup {
 ///
 /// `None` if fewer than ten regions have at least two episodes, for example because all parameters are fixed.
 pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
-    // Each region's counts, and the number of its episodes so far. Its episodes belong to half 0 and half 1 in turn.
+    // For each region: the counts of both halves, and the number of episodes so far. The episodes of a region alternate
+    // between half 0 and half 1.
     let mut parts: BTreeMap<usize, (ContextGroup, usize)> = BTreeMap::new();
     for (part, success) in outcomes.parts().into_iter().zip(&outcomes.successes) {
         let (part, seen) = parts.entry(part).or_default();
@@ -55,12 +56,12 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     if parts.len() < MIN_PARTS {
         return None;
     }
-    // Ranks the regions by half number `chooses`, and measures success in the other half.
+    // Ranks the regions by their success rate in half `chooses` (0 or 1), and measures success in the other half.
     let mut one_way = |chooses: usize| {
         parts.sort_by(|a, b| a.rate(chooses).total_cmp(&b.rate(chooses)));
         judged(&parts, chooses)
     };
-    // The mean of both assignments, in %.
+    // Averages both assignments of the halves, and converts the result to %.
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 

@@ -142,7 +142,7 @@ pub struct ParameterCheck {
     pub largest: Option<Difference>,
 }
 
-/// A requested parameter and the value that the physics used instead.
+/// The difference between the requested value of a parameter and the value that the physics used.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Difference {
     /// The parameter's name in the catalogue.
@@ -202,15 +202,15 @@ impl RecordsMetadata {
         Ok(())
     }
 
-    /// Returns the value of the quantity that the success criterion compares, and of the environment's other quantity
-    /// if there are two.
+    /// Returns two values of an episode. The first is the quantity that the success criterion compares. The second is the
+    /// environment's other quantity, or `None` if both criteria compare the same quantity.
     fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
         let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
     }
 
     /// Returns whether [`EpisodeRecord::achieved`] holds the quantity of [`RecordsMetadata::code_success`]. Returns
-    /// false if the paper's criterion compares the same quantity.
+    /// false if both criteria compare the same quantity.
     pub fn is_judged_by_code(&self) -> bool {
         let quantity = |criterion: &Option<Criterion>| criterion.as_ref().map(|it| it.quantity.clone());
         self.also.is_some() && quantity(&self.success) == quantity(&self.code_success)
@@ -302,7 +302,7 @@ impl Records {
     }
 
     /// Determines the success of all episodes by a criterion whose quantity was not recorded. `values` has the quantity
-    /// for each episode, NaN if the episode has no value. It replaces the recorded values.
+    /// for each episode, NaN if the episode has no value. The recorded values are replaced by `values`.
     ///
     /// # Errors
     /// [`ValueError`] if the number of values is not the number of episodes.
@@ -339,10 +339,10 @@ impl Records {
     }
 }
 
-/// Compares requested with applied parameters of episodes.
+/// Compares the requested with the applied parameters of single episodes.
 #[derive(Clone, Debug)]
 pub struct ParameterComparison {
-    /// The names of the parameters, and for each the index of its quantity among the applied values. `None` if the
+    /// The name of each parameter, and the index of its quantity among the applied values. The index is `None` if the
     /// server did not state the quantity.
     parameters: Vec<(String, Option<usize>)>,
 }
@@ -359,7 +359,8 @@ impl ParameterComparison {
         Self::with(&RecordsMetadata::new(environment, String::new(), 1))
     }
 
-    /// Returns the largest difference between the parameters of an episode, if it exceeds rounding.
+    /// Returns the largest relative difference between an episode's requested and applied values. Returns `None` if it is
+    /// within rounding.
     pub fn difference_beyond_rounding(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         self.largest(requested, applied).filter(Difference::exceeds_tolerance)
     }
@@ -369,8 +370,8 @@ impl ParameterComparison {
         self.parameters.iter().all(|(_, place)| place.is_some())
     }
 
-    /// Returns the largest relative difference between the parameters of an episode. Returns `None` if no parameter has
-    /// an applied quantity. A missing value counts as a difference of NaN.
+    /// Returns the largest relative difference between an episode's requested and applied values. Returns `None` if no
+    /// parameter has an applied quantity. A missing value counts as a difference of NaN.
     fn largest(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         let value = |values: &[f64], place: usize| values.get(place).copied().unwrap_or(f64::NAN);
         let compared = self.parameters.iter().enumerate().filter_map(|(index, (name, place))| {
@@ -396,7 +397,7 @@ fn relative(requested: f64, applied: f64) -> f64 {
 }
 
 impl Difference {
-    /// Returns whether the relative difference exceeds [`ROUNDING`]. NaN does.
+    /// Returns whether the relative difference exceeds [`ROUNDING`] or is NaN.
     pub fn exceeds_tolerance(&self) -> bool {
         self.relative.is_nan() || self.relative > ROUNDING
     }

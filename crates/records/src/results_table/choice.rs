@@ -1,4 +1,4 @@
-//! Rows of a results table that are chosen by their values, and grouped by them.
+//! Selects rows of a results table by their values in some columns, and groups rows with equal values.
 
 use std::str::FromStr;
 
@@ -18,11 +18,11 @@ pub struct RowFilter {
 #[derive(Clone, Debug, PartialEq)]
 enum AcceptedValue {
     Text(String),
-    /// Both ends are accepted.
+    /// All numbers from the first to the second, including both.
     Interval(f64, f64),
 }
 
-/// Rows with the same values of some columns: these values as a name, and the rows.
+/// A group of rows with equal values in some columns. Holds a name that is made of these values, and the rows.
 pub type NamedRows<'a> = (String, Vec<&'a TableRow>);
 
 impl FromStr for RowFilter {
@@ -64,9 +64,9 @@ impl RowFilter {
 }
 
 impl ResultsTable {
-    /// Returns the rows of `study`, or of all studies, that all `filters` accept, grouped by their values of the columns or
-    /// settings in `by`. Groups are in the order of their first row. A name has numbers as `COLUMN=NUMBER`, and texts as
-    /// they are.
+    /// Returns the rows that all `filters` accept, grouped by their values in the columns or settings `by`. Takes the rows
+    /// of `study`, or of all studies if it is `None`. Groups are in the order of their first row. In the name of a group, a
+    /// number has the form `COLUMN=NUMBER`, and a text stands without its column.
     ///
     /// # Errors
     /// [`ValueError`] for an unknown column.

@@ -19,7 +19,8 @@ pub use choice::{NamedRows, RowFilter};
 
 /// Version of the table's columns. Increase it when older programs could misread a table.
 pub const SCHEMA_VERSION: u32 = 1;
-/// The name, in results and records, of the test that selects configurations. No parameter set may have this name.
+/// The name of the test by which a configuration (settings of the training) is selected. Results and records contain this
+/// name, so no parameter set may have it.
 pub const SELECTION_TEST: &str = "selection";
 /// The name of the Parquet schema.
 const MESSAGE: &str = "results";
@@ -50,7 +51,7 @@ pub struct TableRow {
     pub schema_version: u32,
     /// The study's name.
     pub study: String,
-    /// The id of the cell.
+    /// The id of the cell, within its study.
     pub cell: String,
     /// The environment's name.
     pub environment: String,
@@ -169,11 +170,12 @@ impl ResultsTable {
         Ok(Some(Self { studies, rows }))
     }
 
-    /// Finds the table that `path` names, as FILE.parquet or FILE.parquet/STUDY. Returns the file, the table, and STUDY,
-    /// which is empty without one and need not be in the table. Returns `None` if no part of `path` is a Parquet file.
+    /// Reads the table that `path` names. `path` has the form FILE.parquet or FILE.parquet/STUDY. Returns the path of the
+    /// file, the table, and the study's name, which is empty if `path` has none. The table may lack this study. Returns
+    /// `None` if no part of `path` is a Parquet file.
     ///
     /// # Errors
-    /// [`TableError`].
+    /// [`TableError`] if the table is damaged or too new.
     pub fn find(path: &Path) -> Result<Option<(PathBuf, Self, String)>, TableError> {
         let is_table = |path: &&Path| path.extension().is_some_and(|ending| ending == "parquet") && path.is_file();
         let Some(file) = path.ancestors().find(is_table) else { return Ok(None) };
@@ -214,7 +216,7 @@ impl ResultsTable {
     pub fn merge(&mut self, study: &str, plan: StudyPlan, rows: Vec<TableRow>) -> MergeCounts {
         self.studies.insert(study.to_owned(), plan);
         let mut counts = MergeCounts::default();
-        // The new rows and the present rows, by cell.
+        // Groups the new rows (`blocks`) and the table's rows (`earlier`) by cell.
         let mut blocks: Vec<Vec<TableRow>> = Vec::new();
         for row in rows {
             match blocks.last_mut().filter(|block| block[0].cell == row.cell) {
@@ -244,7 +246,7 @@ impl ResultsTable {
                 replacements.insert(cell, block);
             }
         }
-        // Puts the replacing rows in the place of the present rows.
+        // Replaces the old rows of each replaced cell by its new rows, at the position of the first old row.
         let mut written = HashSet::new();
         let mut all = Vec::with_capacity(self.rows.len() + added.len());
         for row in std::mem::take(&mut self.rows) {

@@ -68,8 +68,9 @@ pub fn bootstrap(
     Some(points.into_iter().zip(estimates).map(with_interval).collect())
 }
 
-/// Draws runs with replacement. From each stratum it draws as many runs as the stratum has: `sizes`, all above 0. Calls
-/// `each` `resamples` times, with the indices of the drawn runs by stratum. The same seed draws the same runs.
+/// Draws `resamples` resamples, and calls `each` with every resample. A resample has the indices of the drawn runs by
+/// stratum. The runs of a stratum are drawn with replacement, as many as it has. `sizes` has the number of runs of each
+/// stratum, at least 1. The same seed draws the same runs.
 pub fn resample(sizes: &[usize], resamples: usize, seed: u64, mut each: impl FnMut(&[Vec<usize>])) {
     let mut rng = stream(seed, Purpose::Bootstrap);
     let mut draws: Vec<Vec<usize>> = sizes.iter().map(|&size| vec![0; size]).collect();

@@ -4,22 +4,22 @@
 use perturb_policy::random::{Purpose, stream};
 use rand::Rng;
 
-/// Maximum number of pairs for which all combinations of signs are counted.
+/// Maximum number of pairs for which the p-value is exact: all 2ⁿ combinations of signs are counted.
 const MAX_EXACT_PAIRS: usize = 16;
-/// Number of random combinations of signs that are counted if there are more pairs.
+/// Number of random combinations of signs that are counted if there are more than [`MAX_EXACT_PAIRS`] pairs.
 const CHOICES: u32 = 100_000;
 
 /// Returns the p-value of Fisher's two-sided randomisation test for paired differences (The Design of Experiments,
-/// 1935). It is the probability that the sum of the differences is at least as far from 0 if each difference has a
-/// random sign.
+/// 1935). It is the probability that the sum of the differences is at least as far from 0 as observed, if each
+/// difference gets a random sign.
 ///
-/// Pairs without a difference are ignored. With up to 16 other pairs, all combinations of signs are counted. With more,
-/// 100 000 random combinations are counted besides the observed one, as in Phipson and Smyth (2010). Returns 1 if no
+/// Pairs with a difference of 0 are ignored. With up to 16 remaining pairs, all combinations of signs are counted. With
+/// more, the observed combination and 100 000 random ones are counted, as in Phipson and Smyth (2010). Returns 1 if no
 /// pair differs. The smallest possible value with n ≤ 16 pairs is 2¹⁻ⁿ.
 pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     let differences: Vec<f64> = differences.iter().copied().filter(|difference| *difference != 0.0).collect();
     let seen: f64 = differences.iter().sum::<f64>().abs();
-    // Sums of the same numbers in different orders are equal only up to rounding.
+    // Tolerance for comparing sums, because sums that are equal in theory may differ by rounding errors.
     let rounding = 1e-9 * differences.iter().map(|difference| difference.abs()).sum::<f64>();
     let is_as_far = |signs: u64| {
         let sign = |place: usize| if signs >> (place % 64) & 1 == 1 { 1.0 } else { -1.0 };
@@ -64,8 +64,8 @@ mod tests {
         assert_eq!(sign_flip_p(&[1.0; 16], 1), 2_f64.powi(-15));
     }
 
-    /// With 17 pairs the p-value is estimated from 100 001 of the 131 072 combinations of signs. The estimate's
-    /// standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
+    /// With 17 pairs there are 131 072 combinations of signs. The p-value is estimated from the observed combination and
+    /// 100 000 random ones. The estimate's standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
     #[test]
     fn of_many_pairs_random_signs_come_to_the_same() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
@@ -86,7 +86,8 @@ mod tests {
     #[test]
     fn the_smallest_of_many_counts_most() {
         let corrected = holm(&[0.01, 0.04, 0.03, 0.005]);
-        // 0.005 · 4, 0.01 · 3 and 0.03 · 2; 0.04 · 1 is raised to the value before it.
+        // The sorted p-values are multiplied by 4, 3, 2 and 1: 0.02, 0.03, 0.06 and 0.04. Holm raises the last product to
+        // the one before it, 0.06.
         let expected = [0.03, 0.06, 0.06, 0.02];
         assert!(corrected.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-15), "{corrected:?}");
         assert_eq!(holm(&[0.6, 0.9]), [1.0, 1.0]);

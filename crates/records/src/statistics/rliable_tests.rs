@@ -29,7 +29,7 @@ struct Case {
 #[derive(Deserialize)]
 struct Numbers {
     point: Vec<f64>,
-    /// The runs of each resample: a digit is the index of a run, and a word is a stratum.
+    /// A text for each of rliable's resamples. Its words are the strata, and each digit is the index of a drawn run.
     draws: Vec<String>,
     interval_of_draws: Vec<[f64; 2]>,
     interval_95: Vec<[f64; 2]>,
@@ -38,7 +38,7 @@ struct Numbers {
 /// Tolerance for rounding in sums of a few dozen numbers up to 100.
 const ROUNDING: f64 = 1e-9;
 
-/// Number of resamples in this test. Rliable uses `theirs`.
+/// Number of resamples that this test draws.
 const RESAMPLES: usize = 50_000;
 
 fn compare(
@@ -75,8 +75,8 @@ fn compare(
     }
 
     // A statistic of few scores has only few different values, so the ends of intervals are not compared directly.
-    // Instead, 2.5 % of this test's estimates must be beyond each end of rliable's interval, within five standard
-    // deviations of both.
+    // Instead, 2.5 % of this test's estimates must be beyond each end of rliable's interval, up to five standard
+    // deviations. The deviation accounts for the resamples of this test and of rliable (`theirs`).
     let deviation = |resamples: usize| 0.025 * 0.975 / resamples as f64;
     let uncertain = 5.0 * (deviation(RESAMPLES) + deviation(theirs)).sqrt();
     for (estimates, [low, high]) in estimates.into_inner().into_iter().zip(&expected.interval_95) {
