@@ -9,7 +9,7 @@ use super::colours::{FRAME, INK, LINES, PAPER};
 use super::dashes::dashes;
 use super::{FAMILY, PlotError, WIDTH, drawing, load_font};
 
-/// Font size of all texts, in the measure of plotters. In an SVG, plotters divides it by 1.24, which gives 13.7 units.
+/// Font size of all texts, as plotters expects it. In an SVG, plotters divides it by 1.24, which gives 13.7 units.
 /// A picture printed 85 mm wide then has text of 9.2 pt.
 const TEXT: u32 = 17;
 /// Height of a line of text, in units.
@@ -36,7 +36,8 @@ pub(super) struct LineStyle {
 }
 
 impl LineStyle {
-    /// Returns the style of line `index` of a chart, from 0. Colours and dash patterns repeat with different periods.
+    /// Returns the style of line `index` of a chart, from 0. Colours repeat after 7 lines and dash patterns after 3, so 21
+    /// lines have different styles.
     pub(super) fn nth(index: usize) -> Self {
         Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
     }
@@ -103,8 +104,8 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
     /// Writes a line of text, vertically centred at the position.
     pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
-        // plotters does not centre text exactly: it uses the middle of the letters in an SVG, but a point above it in a
-        // PNG. So all texts are moved down by one unit.
+        // plotters does not centre text exactly. The point of a text that it places at the position is the middle of the
+        // letters in an SVG, and a point above their middle in a PNG. All texts are moved down by one unit.
         self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
     }
 

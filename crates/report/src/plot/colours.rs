@@ -25,7 +25,7 @@ pub(super) const LINES: [RGBColor; 7] = [
     RGBColor(230, 159, 0),
 ];
 
-/// Colours of viridis (Smith and van der Walt, 2015) at equal distances. Colours between them are interpolated.
+/// Colours of viridis (Smith and van der Walt, 2015) for the values 0, 1/8, … 1. Colours between them are interpolated.
 const VIRIDIS: [(u8, u8, u8); 9] = [
     (68, 1, 84),
     (71, 45, 123),
@@ -53,7 +53,8 @@ pub(super) fn viridis(share: f64) -> RGBColor {
     RGBColor(r, g, b)
 }
 
-/// Interpolates linearly between `anchors`, which are at equal distances from 0 to 1. Clamps `share` to this range.
+/// Interpolates linearly between the colours `anchors`, which belong to equally spaced values from 0 to 1. Clamps `share` to
+/// this range.
 fn blend(anchors: &[(u8, u8, u8)], share: f64) -> (u8, u8, u8) {
     let place = share.clamp(0.0, 1.0) * (anchors.len() - 1) as f64;
     let below = (place as usize).min(anchors.len() - 2);
@@ -108,8 +109,8 @@ mod tests {
         }
     }
 
-    /// WCAG requires a contrast of 3 to 1 in graphics. Two colours of the palette have less on white, but lines also
-    /// differ in their dashes.
+    /// WCAG requires a contrast of 3 to 1 in graphics. Two colours of the palette have a lower contrast on white. This is
+    /// accepted, because lines also differ in their dashes.
     #[test]
     fn lines_are_seen_on_white_and_on_a_dark_page() {
         let dark = luminance((0x17, 0x1a, 0x1d)); // report/style.css

@@ -14,8 +14,8 @@ const BETWEEN: f64 = 6.0;
 /// Minimum gap between the numbers of the first and the last tick if only these have numbers, in units. It is the width
 /// of a space.
 const SPACE: f64 = 4.6;
-/// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. Another frame may
-/// be next to it.
+/// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. The limit is small,
+/// because another frame may be next to it.
 const BEYOND: f64 = 2.0;
 /// Maximum number of ticks of an axis.
 const MAX_TICKS: usize = 6;

@@ -156,7 +156,7 @@ impl HeatmapPanels {
         let [_, y] = &self.axes;
         let left = MARGIN + NAME + y_numbers_width(&(y.low..y.high), HEIGHTS.start);
         let columns = self.per_row() as f64;
-        // The last number on the x axis may extend beyond its panel by 2 units.
+        // Leaves 2 units on the right, because the last number on the x axis may extend beyond its panel by as much.
         let width = (f64::from(WIDTH) - left - MARGIN - 2.0 - GAP * (columns - 1.0)) / columns;
         (width.min(WIDEST), width.clamp(HEIGHTS.start, HEIGHTS.end))
     }
@@ -231,7 +231,8 @@ impl HeatmapPanels {
         for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
             let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);
             let corners = [(left, above), (left + SAMPLE.0, above + SAMPLE.1)];
-            // The background is a colour of the heatmap, because white lines are invisible on white.
+            // The background of a symbol is a colour of the heatmap, because the symbol's white lines would be invisible on
+            // white.
             canvas.rectangle(corners, viridis(0.4).filled())?;
             let middle = (left + SAMPLE.0 / 2.0, above + SAMPLE.1 / 2.0);
             match index {

@@ -144,7 +144,7 @@ impl IntervalPlot {
         }
         match row.point {
             Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
-            // The text goes to the side where it does not cover the second number.
+            // If the second number is in the left half, writes the text at the right end, so that they do not overlap.
             None if row.other.is_some_and(|other| frame.x(other) < frame.middle().0) => {
                 canvas.text("missing", (frame.right() - 6.0, y), TextAnchor::Right)?;
             }

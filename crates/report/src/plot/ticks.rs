@@ -10,7 +10,7 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
         return vec![(range.start, tick(range.start))];
     }
     let smallest = (span / most.max(1) as f64).log10().floor() as i32;
-    // The slack includes ticks at the ends of the range despite rounding errors.
+    // Tolerance, in steps between ticks. Without it, rounding errors could exclude a tick at an end of the range.
     let slack = 1e-9;
     let steps = (smallest..smallest + 3).flat_map(|power| [1.0, 2.0, 5.0].map(|factor| (factor, power)));
     let multiples = |(factor, power): (f64, i32)| {
@@ -44,8 +44,8 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// Formats a tick with as many decimals as multiples of ten to the `power` need. `largest` is the largest value of the
-/// axis; it decides whether all ticks are in thousands (k) or millions (M).
+/// Formats a tick. All ticks of the axis are multiples of 10^`power`, which decides on the number of decimals. `largest` is
+/// the largest tick. It decides whether all ticks are written in thousands (k) or millions (M).
 fn written(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {

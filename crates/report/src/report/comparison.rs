@@ -1,5 +1,5 @@
-//! Compares agents that were trained elsewhere, as tables and as a section of a page. A condition is an agent with its
-//! training distribution.
+//! Compares agents that were trained outside of the experiment, as tables and as a section of a page. A condition is an
+//! agent with its training distribution.
 
 use perturb_experiment::distinct;
 use perturb_records::comparison::{ComparedCondition, ComparedScore, ConditionComparison, compare};
@@ -26,9 +26,9 @@ pub struct EnvironmentComparison {
     pub comparison: ConditionComparison,
 }
 
-/// Compares the success rates of agents that were trained elsewhere, in each environment with at least two such agents.
-/// Only tests that all of them have are compared. An agent's policies with the same training distribution count as its
-/// seeds.
+/// Compares the success rates of agents that were trained outside of the experiment, in each environment with at least
+/// two such agents. Only tests that all of them have are compared. An agent's policies with the same training
+/// distribution count as its seeds.
 pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<EnvironmentComparison> {
     let environments = distinct(assessed.iter().map(ExternalEvaluation::environment));
     environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()
@@ -44,7 +44,7 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
     if agents.len() < 2 {
         return None;
     }
-    // Names a condition after its agent, and after its training distribution if an agent has several.
+    // Names a condition after its agent. If an agent has several training distributions, adds the training distribution.
     let condition = |&(agent, trained_on)| {
         let own = policies.iter().filter(|(name, policy)| (*name, policy.trained_on()) == (agent, trained_on));
         let keyed = own.enumerate().map(|(index, (_, policy))| ((index + 1).to_string(), &policy.records));
@@ -115,7 +115,7 @@ impl EnvironmentComparison {
     }
 }
 
-/// Formats an interval; an empty text if there is none.
+/// Formats an interval. Returns an empty text if there is none.
 fn interval(ends: Option<[f64; 2]>) -> String {
     ends.map_or_else(String::new, |[low, high]| format!("[{:.1}, {:.1}]", low + 0.0, high + 0.0))
 }

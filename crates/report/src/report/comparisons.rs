@@ -18,7 +18,7 @@ const MIN_RUNS: usize = 2;
 /// The name that stands for all environments together.
 const ALL: &str = "all";
 
-/// A comparison of the methods x and y by one metric, over the runs that both have in every compared environment.
+/// A comparison of the methods x and y by one metric, over the runs that both methods have in every compared environment.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MethodComparison {
     /// The environment's name, or [`ALL`].
@@ -48,7 +48,7 @@ pub(super) fn comparisons(scope: &ReportIndex<'_>, selections: &[MethodResults<'
 
 /// Compares all methods over `environments`, and corrects the p-values of these comparisons together. Leaves out
 /// reference methods such as the random policy, because each of them would raise all corrected p-values. Also leaves
-/// out agents that were trained elsewhere, because their runs share no seeds with other runs.
+/// out agents that were trained outside of the experiment, because their runs share no seeds with other runs.
 fn family(
     scope: &ReportIndex<'_>,
     selections: &[MethodResults<'_>],
@@ -175,7 +175,7 @@ mod tests {
         let comparison = compared(&[x.clone(), x.clone(), y.clone(), y]).unwrap();
         assert_eq!((comparison.difference.point, comparison.difference.interval_95), (1.0, Some([1.0, 1.0])));
         assert_eq!((comparison.pairs, comparison.p), (6, 2_f64.powi(-5)));
-        // Of the 9 pairs of a run of x and a run of y, x is better in 3 + 2 + 1.
+        // Each of x's three runs is compared with each of y's three runs. The runs of x are better in 3, 2 and 1 of them.
         assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
         assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
     }

@@ -1,12 +1,13 @@
-//! Notes of a report about agents that were trained elsewhere.
+//! Notes of a report about agents that were trained outside of the experiment.
 
 use std::collections::BTreeMap;
 
 use perturb_experiment::{MethodResults, Results, distinct, elsewhere};
 use perturb_records::{ExternalEvaluation, ExternalPolicy};
 
-/// Returns the sentences about agents that were trained elsewhere: that they exist, how each policy was trained and
-/// tested, and whether its environment differs. Returns an empty list if there are no such agents.
+/// Returns the sentences about agents that were trained outside of the experiment: that they exist, how each policy was
+/// trained and tested, and whether the revision or the model of its environment differs from others. Returns an empty
+/// list if there are no such agents.
 pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>]) -> Vec<String> {
     let agents = distinct(selections.iter().filter(|row| row.method.external).map(|row| row.method.clone()));
     if agents.is_empty() {

@@ -122,27 +122,27 @@ impl<'a> Report<'a> {
 
 /// Returns a sentence that names the method with the best Extrapolation and the next one, and compares Extrapolation
 /// with Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
-/// they share the first place and none is called best. Numbers of a single run are marked, and then no method is called
-/// best either. The random policy is left out, because it has learned nothing.
+/// they share the first place and none is called best. If a method has a single run, no method is called best either, and
+/// the method's numbers are marked. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     // Ranks the methods by Extrapolation.
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
     let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
     let mut ranked: Vec<_> =
-        learned.iter().filter_map(|row| both(row).map(|(default, its)| (*row, default, its))).collect();
+        learned.iter().filter_map(|row| both(row).map(|(default, mean)| (*row, default, mean))).collect();
     ranked.sort_by(|(.., a), (.., b)| b.point.total_cmp(&a.point));
     let &(best, default, extrapolation) = ranked.first()?;
     let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
-    let zeros = zero_sentence(ranked.iter().filter(|(.., its)| its.point == 0.0).map(|(row, ..)| *row));
+    let zeros = zero_sentence(ranked.iter().filter(|(.., mean)| mean.point == 0.0).map(|(row, ..)| *row));
     if ranked.len() == 1 {
         return Some(format!("{} comes to {numbers}.{zeros}", best.method));
     }
-    let written = |its: &Bootstrapped| format!("{:.1}", its.point);
+    let written = |mean: &Bootstrapped| format!("{:.1}", mean.point);
     let number = written(&extrapolation);
     // `first` are the best methods: several if their rounded numbers are equal.
-    let (first, others) = ranked.split_at(ranked.partition_point(|(.., its)| written(its) == number));
-    let some_of_one_run = ranked.iter().any(|(.., its)| its.runs == 1);
+    let (first, others) = ranked.split_at(ranked.partition_point(|(.., mean)| written(mean) == number));
+    let some_of_one_run = ranked.iter().any(|(.., mean)| mean.runs == 1);
     let claimed = if some_of_one_run { "comes out first" } else { "generalises best" };
     let found = match first {
         _ if number == "0.0" => "none extrapolates: each has Extrapolation of 0.0 %".to_owned(),
@@ -150,21 +150,21 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
         _ => format!(
             "none {claimed}: {} come to the same Extrapolation, {}",
             listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
-            listed(&distinct(first.iter().map(|(.., its)| shown(*its)))),
+            listed(&distinct(first.iter().map(|(.., mean)| shown(*mean)))),
         ),
     };
-    // Compares with the next method by intervals, if both have one.
-    let next = others.first().map(|(row, _, its)| {
-        let lowest = first.iter().map(|(.., its)| Some(its.interval_95?[0])).reduce(|a, b| Some(a?.min(b?)));
-        let intervals = match (lowest.flatten(), its.interval_95) {
+    // Compares the intervals of the best methods and of the next method, if all of these have one.
+    let next = others.first().map(|(row, _, extrapolation)| {
+        let lowest = first.iter().map(|(.., mean)| Some(mean.interval_95?[0])).reduce(|a, b| Some(a?.min(b?)));
+        let intervals = match (lowest.flatten(), extrapolation.interval_95) {
             (Some(low), Some([_, high])) if high < low => ", and their intervals are apart",
             (Some(_), Some(_)) => ", and their intervals overlap",
             _ => "",
         };
-        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*its))
+        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*extrapolation))
     });
     let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
-    let differences: Vec<f64> = ranked.iter().map(|(_, default, its)| rounded(its.point - default.point)).collect();
+    let differences: Vec<f64> = ranked.iter().map(|(_, default, mean)| rounded(mean.point - default.point)).collect();
     let [least, most] = [f64::min, f64::max].map(|of| differences.iter().copied().reduce(of).unwrap_or_default());
     Some(format!(
         "of {}{of} methods {found}{}. Extrapolation less Default is {least:+.1} to {most:+.1} points.{zeros}",
@@ -173,8 +173,8 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     ))
 }
 
-/// Returns a sentence that names the methods whose Extrapolation is 0 only because some scenarios have no success, with
-/// these scenarios. Returns an empty text if there are no such methods.
+/// Returns a sentence that names the methods whose Extrapolation is 0 only because some scenarios have no success. It also
+/// names these scenarios. Returns an empty text if there are no such methods.
 fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
     let by = |row: &MethodMetrics<'_>| {
         let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();

@@ -1,5 +1,5 @@
-//! Pictures of the heatmaps of an experiment and of agents that were trained elsewhere: one for each environment, pair
-//! of parameters and method.
+//! Pictures of the heatmaps of an experiment and of agents that were trained outside of the experiment: one for each
+//! environment, pair of parameters and method.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -31,8 +31,8 @@ pub struct HeatmapPictures {
     pub missing: Vec<NoHeatmap>,
 }
 
-/// A picture without its colour scale. The scale is known when all drafts of the environment are made, because they
-/// share it.
+/// A picture without its colour scale. All pictures of an environment share a colour scale, which depends on all of their
+/// heatmaps. It is therefore known only after all drafts are made.
 struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,
@@ -67,8 +67,8 @@ struct Origin {
 }
 
 /// Returns the pictures of all heatmaps of the policies in `selections`. Heatmaps of cells are read from `folder`, an
-/// experiment's folder. Heatmaps of agents that were trained elsewhere come from their recorded tests. A picture
-/// without any heatmap is left out.
+/// experiment's folder. Heatmaps of agents that were trained outside of the experiment come from their recorded tests.
+/// A picture without any heatmap is left out.
 ///
 /// # Errors
 /// [`FolderError`] if a file exists but cannot be read.
@@ -129,8 +129,8 @@ fn shown<'a>(
     Ok(ShownPolicy { trained_on: place.trained_on, run: place.run, content })
 }
 
-/// Returns the heatmaps of an agent that was trained elsewhere, ordered by training distribution and run, as for cells.
-/// Returns an empty list if the row is not of such an agent.
+/// Returns the heatmaps of an agent that was trained outside of the experiment, ordered by training distribution, then
+/// run. Returns an empty list if the row is not of such an agent.
 fn shown_elsewhere<'a>(row: &MethodResults<'a>) -> Vec<(HeatmapKind, ShownPolicy<'a>)> {
     let mut all = Vec::new();
     for (&run, of_run) in &row.runs {
@@ -206,7 +206,7 @@ impl<'a> Draft<'a> {
         let origins = || self.columns.iter().flat_map(|column| &column.origins);
         let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();
         let commits: BTreeSet<&str> = origins().filter_map(|origin| origin.commit.as_deref()).collect();
-        let columns: Vec<String> = self.columns.iter().map(PictureColumn::told).collect();
+        let columns: Vec<String> = self.columns.iter().map(PictureColumn::description).collect();
         format!(
             "{of}. Means over runs: {}. {tested} of each policy, test {} {}.{}",
             columns.join("; "),
@@ -231,7 +231,7 @@ impl<'a> Draft<'a> {
 impl PictureColumn<'_> {
     /// Returns the column for drawing.
     fn panel(&self) -> HeatmapColumn {
-        let content = self.mean.clone().ok_or_else(|| said(self.missing.iter()));
+        let content = self.mean.clone().ok_or_else(|| joined_reasons(self.missing.iter()));
         HeatmapColumn { caption: format!("trained on {}, {}", self.trained_on, self.runs()), content }
     }
 
@@ -244,12 +244,12 @@ impl PictureColumn<'_> {
     }
 
     /// Describes the column's runs, with the reasons for missing heatmaps.
-    fn told(&self) -> String {
-        let told = format!("{} trained on {}", self.runs(), self.trained_on);
+    fn description(&self) -> String {
+        let runs = format!("{} trained on {}", self.runs(), self.trained_on);
         let why = |(run, why): &(u32, NoHeatmap)| format!("run {run}: {why}");
         match self.missing.iter().map(why).collect::<Vec<_>>() {
-            missing if missing.is_empty() => told,
-            missing => format!("{told} ({})", missing.join(", ")),
+            missing if missing.is_empty() => runs,
+            missing => format!("{runs} ({})", missing.join(", ")),
         }
     }
 }
@@ -287,7 +287,7 @@ pub fn save_heatmaps<'a>(all: &'a HeatmapPictures, out: &Path) -> Result<Vec<&'a
 }
 
 /// Joins the different reasons for missing heatmaps.
-fn said<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
+fn joined_reasons<'a>(missing: impl Iterator<Item = &'a (u32, NoHeatmap)>) -> String {
     distinct(missing.map(|(_, why)| why.to_string())).join("; ")
 }
 

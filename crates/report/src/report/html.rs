@@ -115,7 +115,7 @@ impl ReportBundle<'_> {
     }
 }
 
-/// Renders the page. Results come first; the last section says how they were made and which pictures are missing.
+/// Renders the page. Results come first. The last section says how the results were made and which pictures are missing.
 fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing: &[String]) -> Markup {
     let title = report.title();
     html! {
@@ -272,7 +272,8 @@ fn table_subsection(table: &Table, shaded: bool) -> Subsection {
                     tr {
                         @for (i, column) in table.columns.iter().enumerate() {
                             th class=[classes(&[("text", !column.is_number), ("start", starts(i))])] scope="col" {
-                                // The first column of a group has the name of the group, which is already above it.
+                                // If a column has the same name as its group, the header shows "here" instead. The name
+                                // is already in the group's header above it.
                                 @if column.group.as_ref() == Some(&column.name) { "here" } @else { (column.name) }
                             }
                         }

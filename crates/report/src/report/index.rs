@@ -1,5 +1,5 @@
-//! The environments, methods and test sets that a report shows, from its plan and from agents that were trained
-//! elsewhere.
+//! The environments, methods and test sets that a report shows, from its plan and from agents that were trained outside
+//! of the experiment.
 
 use std::collections::BTreeSet;
 
@@ -11,7 +11,7 @@ use perturb_settings::Method;
 /// The environments, methods and test sets of a report, in the order in which they are shown.
 #[derive(Clone, Debug)]
 pub(super) struct ReportIndex<'a> {
-    /// The environments that averages are over: the plan's environments, or all environments if there is no plan.
+    /// The environments over which results are averaged: the plan's environments, or all environments without a plan.
     pub(super) averaged: Vec<&'a str>,
     /// All environments in the report.
     pub(super) environments: Vec<&'a str>,
@@ -42,13 +42,14 @@ pub(super) fn version(name: &str) -> Option<Version> {
     Version::KNOWN.into_iter().find(|version| version.to_string() == name)
 }
 
-/// Returns whether a row is shown in the tables of scenarios. Agents that were not trained on a known version are not.
+/// Returns whether a row is shown in the tables of scenarios. A row of an agent that was trained outside of the
+/// experiment is shown only if a policy was trained on a version.
 pub(super) fn has_scenarios(row: &MethodResults<'_>) -> bool {
     !row.method.external || trained_on(row).iter().any(|one| matches!(one, TrainedOn::Version(_)))
 }
 
-/// Returns the training distributions of all policies in a row. Runs of an agent that was trained elsewhere may have
-/// different ones, so this is their union.
+/// Returns the training distributions of all policies in a row: the union over its runs. The runs of an agent that was
+/// trained outside of the experiment may have different training distributions.
 pub(super) fn trained_on<'a>(row: &MethodResults<'a>) -> BTreeSet<TrainedOn<'a>> {
     row.runs.values().flat_map(|run| run.selected.keys().copied()).collect()
 }

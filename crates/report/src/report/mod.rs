@@ -58,8 +58,8 @@ pub struct Report<'a> {
 
 impl<'a> Report<'a> {
     /// Computes the report of `results`. `selections` are the selected policies, including agents that were trained
-    /// elsewhere. `recorded` has the recorded episodes of selected cells. `checks` are the comparisons of requested and
-    /// applied parameters in recorded episodes.
+    /// outside of the experiment. `recorded` has the recorded episodes of selected cells. `checks` are the comparisons
+    /// of requested and applied parameters in recorded episodes.
     pub fn new(
         results: &'a Results<'a>,
         selections: &'a [MethodResults<'a>],

@@ -57,7 +57,7 @@ impl MethodMetrics<'_> {
         Some(self.ours.get(&metric)?.mean - self.papers.get(&metric)?.mean)
     }
 
-    /// Returns the number of runs in the metric with the fewest; 0 if a metric is missing.
+    /// Returns the smallest number of runs of a metric; 0 if a metric is missing.
     pub(super) fn runs(&self) -> usize {
         least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
@@ -124,7 +124,7 @@ pub(super) fn averages<'a>(
             method,
         }
     };
-    // Agents that were trained elsewhere and lack some environment have no average.
+    // Agents that were trained outside of the experiment and lack some environment have no average.
     let methods = scope.methods.iter().filter(|method| !method.external || is_everywhere(method));
     methods.cloned().map(of_method).collect()
 }

@@ -19,7 +19,7 @@ const PAPER_TEST_EPISODES: u64 = 1000;
 /// Maximum number of failures whose reasons the report shows.
 const MAX_REASONS: usize = 3;
 
-/// Returns the sentences. Code words are between backticks.
+/// Returns the sentences of the report's last section. Words of code are between backticks.
 pub(super) fn sentences(
     results: &Results<'_>,
     selections: &[MethodResults<'_>],
@@ -28,7 +28,7 @@ pub(super) fn sentences(
 ) -> Vec<String> {
     let (cells, done, failed) = (results.plan.cells.len(), results.done().count(), results.failures().count());
     let mut lines = Vec::new();
-    // How many cells are done, why cells failed, and how configurations were selected.
+    // Adds sentences on finished and failed cells, on the selection of configurations, and on the plan's settings.
     if cells > 0 {
         lines
             .push(format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed));
@@ -44,7 +44,7 @@ pub(super) fn sentences(
         lines.push(settings(results.plan));
     }
     lines.extend(external::sentences(results, selections));
-    // Rows of the tables that lack cells.
+    // Adds a sentence on the table rows for which cells are missing.
     let incomplete = selections.iter().filter(|selection| selection.done < selection.cells).count();
     if incomplete > 0 {
         let rows = selections.iter().filter(|row| !row.method.external).count();
@@ -60,7 +60,7 @@ pub(super) fn sentences(
             count(rows, "row")
         ));
     }
-    // The versions of the program, and the checks of the data.
+    // Adds sentences on the versions of the program, on the checked parameters, and on recorded episodes.
     let commits: BTreeSet<&str> = results.done().flat_map(|result| result.commits()).collect();
     if !commits.is_empty() {
         lines.push(format!("Done by perturb {}.", commits.into_iter().collect::<Vec<_>>().join(", ")));

@@ -1,5 +1,5 @@
 //! The inputs of a report: an experiment (a folder or a study in a results table), assessments of agents that were
-//! trained elsewhere, or both.
+//! trained outside of the experiment, or both.
 
 use std::path::{Path, PathBuf};
 
@@ -20,7 +20,7 @@ use crate::plot::PlotError;
 /// The name of the study when a folder is exported to a table.
 const EXPORTED: &str = "experiment";
 
-/// The inputs of a report, from which [`ReportInputs::read`] makes it.
+/// The inputs of a report. [`ReportInputs::read`] reads them and computes the report.
 #[derive(Clone, Debug, Default)]
 pub struct ReportInputs {
     /// The folder of the experiment; `None` if the report is of a study or of assessments alone.
@@ -29,7 +29,7 @@ pub struct ReportInputs {
     pub study: Option<StudySource>,
     /// The selection rule to use in place of the plan's; `None` for the plan's own rule.
     pub rule: Option<Selection>,
-    /// Assessments of agents that were trained elsewhere, in the order in which the report shows them.
+    /// Assessments of agents that were trained outside of the experiment, in the order in which the report shows them.
     pub assessed: Vec<ExternalEvaluation>,
 }
 
@@ -89,7 +89,7 @@ pub struct ReportBundle<'a> {
     pub report: Report<'a>,
     /// The training curves of each environment.
     pub curves: &'a [EnvironmentCurves],
-    /// Comparisons of agents that were trained elsewhere, for each environment with several of them.
+    /// Comparisons of agents that were trained outside of the experiment, for each environment with several of them.
     pub comparisons: Vec<EnvironmentComparison>,
     /// The pictures of heatmaps.
     pub heatmaps: &'a HeatmapPictures,
@@ -187,8 +187,8 @@ impl StudySource {
     }
 
     /// Reads the recorded episodes of selected cells, if they exist, into `recorded`. For a study without a folder,
-    /// also adds the comparisons of parameters in all its episodes to `checks`; for a folder, the export already did
-    /// so.
+    /// also adds the comparisons of requested and applied parameters in all its episodes to `checks`. For a folder,
+    /// `exported` has already added them.
     fn add_episodes(
         &self,
         folder: Option<&Folder>,

@@ -112,8 +112,8 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns a picture for each environment and training version, with a panel for each parameter. Training on
-    /// parameter sets of the plan is left out.
+    /// Returns a picture for each environment and training version, with a panel for each parameter. Leaves out
+    /// trainings and tests on the plan's own parameter sets.
     pub(super) fn parameter_pictures(&self) -> Vec<Picture> {
         let is_of_version = |row: &&SweepPoint<'_>| Version::ALL.iter().any(|it| it.to_string() == row.tested_on);
         let all: Vec<_> = self.over_parameters.iter().filter(is_of_version).collect();

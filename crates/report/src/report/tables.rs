@@ -106,7 +106,8 @@ impl Report<'_> {
         self.selections.iter().flat_map(of).collect()
     }
 
-    /// Returns the tests to list for a row. For agents that were trained elsewhere, lists only tests that were run.
+    /// Returns the tests to list for a row. For agents that were trained outside of the experiment, lists only tests
+    /// that were run.
     pub(super) fn tests_of<'r>(
         &'r self,
         (row, train): ScenarioRow<'r, 'r>,
