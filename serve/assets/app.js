@@ -5,7 +5,7 @@
   // Okabe and Ito's colours, for all kinds of colour vision.
   const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"];
   const NARROWEST = 200, HEIGHT = 220;
-  // Charts of trainings, by the names of their elements.
+  // Colour (an index of COLOURS) and y range of each chart, by the name of the chart's element.
   const CURVES = {
     return: { colour: 0 },
     success: { colour: 2, range: [0, 100] },
@@ -58,7 +58,7 @@
     };
   }
 
-  // Draws a chart. Replaces an existing plot of another kind.
+  // Draws `data` in a figure. Keeps the figure's plot if `key` and the colours of the page are unchanged, else makes a new one.
   function plot(figure, key, data, make) {
     const place = figure.querySelector(".plot");
     const known = plots.get(figure);
@@ -105,7 +105,7 @@
     figure.dataset.reach = curve[by][curve[by].length - 1];
   }
 
-  // Draws the curves of several runs, with one colour for each kind.
+  // Draws the curves of several runs, with one colour for each kind of run (`run.kind`).
   function drawRuns(figure, runs, name) {
     figure.parentElement.hidden = runs.length === 0;
     if (runs.length === 0) return clear(figure);
@@ -174,7 +174,7 @@
     new ResizeObserver(fit).observe(report.parentElement);
   }
 
-  // Returns a key that identifies an element among its siblings: its link address or its text.
+  // Returns a key that identifies an element among its siblings: the address of its first link or picture, or null.
   const keyOf = (node) =>
     node.nodeType !== Node.ELEMENT_NODE ? null
       : node.getAttribute("href") ?? node.getAttribute("src") ?? node.querySelector("[href], [src]")?.getAttribute("href")
@@ -199,7 +199,7 @@
     for (const child of [...fresh.childNodes]) {
       const found = left.findIndex((old) => alike(old, child));
       const [old] = found < 0 ? [] : left.splice(found, 1);
-      // Skipped elements are moved later or removed.
+      // Elements before the found one are kept if they occur later in `fresh`, otherwise removed.
       if (old && found === 0) become(old, child);
       else if (old) {
         const gone = left.splice(0, found);
@@ -222,7 +222,7 @@
     if (address && document.activeElement !== had) place.querySelector(`[href="${CSS.escape(address)}"]`)?.focus();
   }
 
-  // Shows the link to the curves of the chosen trainings once there are two.
+  // Shows the link to the curves of the chosen trainings if at least two trainings are chosen.
   const charted = document.getElementById("charted");
   const curves = charted?.getAttribute("href");
   function showChosen() {

@@ -1,4 +1,5 @@
-//! The state of a saved assessment. It is read again when its files change.
+//! The state of a saved assessment: recorded tests of a policy, which the Python package wrote. The state is read again when
+//! its files change.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
@@ -47,7 +48,7 @@ impl LiveAssessment {
         self.status.as_ref().map_err(String::as_str)
     }
 
-    /// Returns a hash of the files' stamps.
+    /// Returns a hash of the files' sizes and times. It changes when the report must be built again.
     pub(crate) fn report_fingerprint(&self) -> u64 {
         let mut hasher = DefaultHasher::new();
         self.stamps.hash(&mut hasher);

@@ -17,7 +17,7 @@ const LOAD_TIMEOUT: Duration = Duration::from_secs(20);
 #[derive(Debug)]
 pub(crate) struct CachedLoader<T> {
     last: Arc<Mutex<Option<LoadedValue<T>>>>,
-    /// Whether a load has already taken longer than callers wait, and still runs.
+    /// Whether the running load has already taken longer than callers wait for it.
     is_overdue: Arc<AtomicBool>,
 }
 
@@ -65,7 +65,8 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
     /// Returns the last value if the pause since its load is not over. Otherwise waits for one of `permits`, calls
     /// `load`, and returns the new value.
     ///
-    /// A load continues even if no caller waits for it any more. It returns its permit after [`LOAD_TIMEOUT`].
+    /// A load continues even if no caller waits for it any more. It releases its permit when it ends, or after
+    /// [`LOAD_TIMEOUT`] if it takes longer.
     pub(crate) async fn get(
         &self,
         permits: &Arc<Semaphore>,
@@ -167,7 +168,8 @@ mod tests {
             Err(CachedLoadError::Panicked),
             "there is a pause after a panic, too"
         );
-        // Printing the panic's backtrace counts as part of the load.
+        // The pause may last some time, because it depends on the duration of the load. Printing the panic's backtrace
+        // counts as a part of the load.
         while broken.get(&permits, || 8).await == Err(CachedLoadError::Panicked) {
             tokio::time::sleep(Duration::from_millis(20)).await;
         }

@@ -25,7 +25,7 @@ use tower_service::Service;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ConnectionLimits {
     /// Maximum number of open connections. A browser opens about six. When the maximum is reached, a new connection
-    /// replaces the oldest one that has no request in progress. If all have one, the new connection waits.
+    /// replaces the oldest one that has no request in progress. If all connections have one, the new connection waits.
     max_connections: usize,
     /// Maximum time for a client to send the head of a request. It counts from the start of the connection, or from the
     /// end of the last response.

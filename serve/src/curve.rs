@@ -15,8 +15,8 @@ const MIN_EPISODES_PER_POINT: usize = 10;
 const MIN_SPEED_SECONDS: f64 = 1.0;
 /// Maximum number of different speeds in a curve.
 const MAX_SPEEDS: f64 = 40.0;
-/// Maximum time between the ends of two consecutive parts of the curve that count as written to the log at once. It is
-/// given as a share of the time over which the speed is measured.
+/// Two consecutive parts of the curve count as written to the log at once if the times of their last episodes differ by less
+/// than this. The unit is the time over which the speed is measured.
 const SAME_BLOCK_SHARE: f64 = 0.02;
 
 /// The episodes of a growing log, summed up in groups.
@@ -212,7 +212,7 @@ impl EpisodeLog {
 /// Returns the speed of each part of the curve, in steps per second.
 ///
 /// A training writes many episodes at once, and all of them get the time of writing. Therefore consecutive parts are
-/// combined until they cover enough time, and all of them get their mean speed.
+/// combined until they cover enough time. Each part gets the mean speed of the parts with which it was combined.
 fn speeds(parts: &[EpisodeGroup]) -> Vec<Option<f64>> {
     let end = parts.last().map_or(0.0, |last| last.end);
     let mut speeds = Vec::new();

@@ -70,7 +70,7 @@ mod tests {
         assert_eq!(eta.remaining_seconds(at(5), &[0.9, 0.0, 0.0], &weights), None, "too early");
         assert_eq!(eta.remaining_seconds(at(20), &[0.5, 0.0, 0.0], &weights), None, "nothing was done");
         eta.sample(at(20), &[1.0, 0.0, 0.0]);
-        // 5 of 40 were done in 20 s, so 30 remain.
+        // The weights sum to 40. At the first sample 5 were done, and 5 more in the next 20 s, so 30 remain.
         assert_eq!(eta.remaining_seconds(at(20), &[1.0, 0.0, 0.0], &weights), Some(120.0));
         eta.sample(at(40), &[0.0, 0.0, 0.0]);
         let anew = eta.remaining_seconds(at(60), &[0.1, 0.0, 0.0], &weights).unwrap(); // 1 of 40 in 20 s

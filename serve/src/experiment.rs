@@ -1,4 +1,4 @@
-//! The state of an experiment. It is read again when its files change.
+//! The state of an experiment, which consists of cells: trainings with their tests. It is read again when its files change.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -16,9 +16,9 @@ use crate::curve::LearningCurve;
 use crate::eta::Eta;
 use crate::training::{LOCK_INTERVAL, LiveTraining};
 
-/// Maximum number of running cells whose curves are read.
+/// Maximum number of running cells (trainings) whose learning curves are read.
 pub(crate) const MAX_CURVES: usize = 48;
-/// Approximate duration of a test episode, as a share of the duration of a training episode.
+/// Approximate duration of a test episode, as a fraction of the duration of a training episode.
 const TEST_SHARE: f64 = 0.25;
 /// Time for which the experiment still counts as running after its last running cell was seen. It covers the time
 /// between the end of a cell and the start of the next one.
@@ -39,7 +39,7 @@ pub(crate) struct LiveExperiment {
     /// Stamps (sizes and times) of the folder `cells/` and of the plan.
     stamps: [Option<Stamp>; 2],
     status: Result<ExperimentStatus, String>,
-    /// Time at which a running cell was last seen.
+    /// Time at which a cell was last seen running.
     worked: Option<Instant>,
     /// Trainings of the first [`MAX_CURVES`] running cells, by the cells' ids.
     trainings: HashMap<String, LiveTraining>,
@@ -159,14 +159,14 @@ impl LiveExperiment {
         self.refresh();
         let Ok(status) = &self.status else { return self.trainings.clear() };
         let is_inside = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
-        // The curves of running cells.
+        // Refreshes the learning curves of running cells.
         let first: Vec<&str> = working(status).filter(|id| is_inside(id)).take(MAX_CURVES).collect();
         self.trainings.retain(|id, _| first.contains(&id.as_str()));
         for id in first {
             let training = || LiveTraining::new(&self.root, &status.folder.cell(id).training());
             self.trainings.entry(id.to_owned()).or_insert_with(training).refresh_details();
         }
-        // The estimate of the remaining time.
+        // Updates the estimate of the remaining time.
         let settled = status.count(CellStatus::is_settled);
         if self.weighted != settled || self.weights.len() != status.cells.len() {
             self.weighted = settled;
@@ -178,7 +178,7 @@ impl LiveExperiment {
         } else {
             self.eta.sample(Instant::now(), &shares);
         }
-        // The files of the report, and the cells whose trainings have a page.
+        // Lists the files of the report, and the cells whose trainings have a page.
         let settled = (settled, status.changed());
         let files = &self.report_files;
         let is_due = files.settled != settled || files.at.is_none_or(|at| at.elapsed() >= LOCK_INTERVAL);
@@ -242,7 +242,7 @@ impl LiveExperiment {
         self.trainings.get(id)
     }
 
-    /// Tells whether a cell's training has a page.
+    /// Tells whether a cell's training has a page, i.e. whether it has begun.
     pub(crate) fn has_page(&self, id: &str) -> bool {
         self.with_page.contains(id)
     }
@@ -296,7 +296,7 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.durations();
     let cells = &status.plan.cells;
     let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
-    // Seconds per episode, of each cell whose kind was measured.
+    // The measured seconds per episode of each cell. Cells of kinds without a measured duration are left out.
     let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
     let mean = if measured.is_empty() { 1.0 } else { perturb_records::statistics::mean(measured.iter().copied()) };

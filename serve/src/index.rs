@@ -1,4 +1,4 @@
-//! The list of all runs below the served folder.
+//! The list of all runs (trainings, experiments and assessments) below the served folder.
 
 use perturb_experiment::runs::{RunFolder, RunKind, RunSummary, places};
 use perturb_files::FileError;
@@ -17,7 +17,7 @@ pub(crate) const MAX_ROWS: usize = 500;
 /// Maximum number of shown pictures from folders that are not runs.
 const MAX_PICTURES: usize = 24;
 
-/// The list of all runs below the served folder.
+/// The list of all runs (trainings, experiments and assessments) below the served folder.
 #[derive(Debug)]
 pub(crate) struct Index {
     /// At most [`MAX_ROWS`] runs. Running ones come first, and the others follow by the time of their last change,

@@ -55,7 +55,7 @@ pub struct ServeOptions {
     /// Host names that requests may state in addition to localhost, e.g. the name of a reverse proxy. They matter only
     /// if the server listens on the loopback address.
     pub hosts: Vec<String>,
-    /// A perturb-server whose status the page shows.
+    /// A perturb-server (a server that simulates environments) whose status the page shows.
     pub server: Option<perturb_protocol::Address>,
 }
 

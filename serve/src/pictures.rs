@@ -8,7 +8,7 @@ use crate::paths::RelativePath;
 
 /// Maximum number of pictures of a run that its page shows.
 const MAX_PICTURES: usize = 60;
-/// Subfolders of a run that are not searched. They have no pictures, or their pictures are shown elsewhere.
+/// Subfolders of a run that are not searched. They have no pictures, or other parts of the pages show their pictures.
 const SKIPPED_FOLDERS: [&str; 5] = ["cells", "checkpoint", "marks", "report", "slurm"];
 /// File name extensions of pictures and films.
 const EXTENSIONS: [&str; 5] = ["svg", "png", "gif", "mp4", "webm"];

@@ -25,7 +25,7 @@ use crate::runs::Runs;
 use crate::server_status::{self, ServerMonitor};
 use crate::training::LiveTraining;
 
-/// Maximum number of pages whose files are read at the same time. It leaves processor time to trainings.
+/// Maximum number of pages whose files are read at the same time. The limit leaves processor time to trainings.
 const MAX_CONCURRENT_LOADS: usize = 4;
 /// Maximum time for which [`Publisher::publish`] waits until all its pages are loaded. Pages that take longer are
 /// published as soon as they are loaded.
@@ -206,7 +206,7 @@ impl Publisher {
             let start = Instant::now();
             self.publish(topics).await;
             let next_round = tokio::time::Instant::now() + pause_after(start.elapsed());
-            // During the pause, only pages of new subscribers without an event are loaded.
+            // During the pause, loads only the pages of new subscribers that have not received any event.
             while tokio::time::timeout_at(next_round, self.subscribed.notified()).await.is_ok() {
                 tokio::time::sleep(DEBOUNCE).await;
                 self.publish(self.subscribed_topics(|event| event.is_empty())).await;
@@ -220,7 +220,7 @@ impl Publisher {
         topics.retain(|topic, sender| {
             let has_subscribers = sender.receiver_count() > 0;
             if !has_subscribers && matches!(topic, Topic::Curves(_)) {
-                // Clients can choose any number of sets of trainings.
+                // Clears the cache at once, because clients can choose any number of combinations of trainings.
                 self.loaders.remove(topic);
             }
             has_subscribers
@@ -244,7 +244,7 @@ impl Publisher {
                 tokio::spawn(async move { this.publish_topic(&topic).await })
             })
             .collect();
-        // `publish_topic` sends an error if its load panics, and continues after the timeout.
+        // A timeout is ignored, because `publish_topic` continues in its own task. It sends an error if its load panics.
         let _ = tokio::time::timeout(BROADCAST_TIMEOUT, futures_util::future::join_all(loads)).await;
     }
 

@@ -17,7 +17,7 @@ pub(crate) const MAX_TRAININGS: usize = 8;
 pub(crate) struct ChartedTraining {
     #[serde(skip)]
     relative: RelativePath,
-    /// The shown name, which is also the kind by which the script chooses colours.
+    /// The shown name. `kind` has the same value: the script chooses colours by `kind`, so each training has its own colour.
     id: String,
     kind: String,
     #[serde(skip)]
@@ -64,7 +64,7 @@ pub(crate) fn update(root: &Root, chosen: &[RelativePath], found: &[ChartedTrain
     }
 }
 
-/// Returns the page, whose parts and curves come with its events.
+/// Returns the page. Its parts and curves are empty until the first event.
 pub(crate) fn page(root: &Root, chosen: &[RelativePath]) -> String {
     let title = "Learning curves of several trainings";
     let breadcrumbs = html! {

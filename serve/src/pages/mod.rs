@@ -37,11 +37,11 @@ pub(crate) struct Update {
     pub(crate) parts: Vec<(&'static str, Markup)>,
     /// The numbers that the page's charts show.
     pub(crate) charts: Value,
-    /// Fingerprint of the report that a request would get now.
+    /// Fingerprint (hash of the source files) of the report that a request would get now.
     pub(crate) report: u64,
     /// Files of the report of an experiment or an assessment; `None` for other pages.
     pub(crate) report_source: Option<ReportSource>,
-    /// Links to the runs whose folders contain this one.
+    /// Links to the runs whose folders contain the folder of this page's run.
     breadcrumbs: Markup,
 }
 
@@ -78,7 +78,7 @@ impl Update {
     }
 }
 
-/// Returns the event for subscribers of a page that cannot be shown.
+/// Returns the event that tells open pages why their content cannot be shown any more.
 pub(crate) fn error_event(error: &ViewError) -> String {
     let message = match error {
         ViewError::RunNotFound => "There is no run here any more.".into(),
@@ -225,7 +225,7 @@ fn chart(name: &str, title: &str) -> Markup {
     }
 }
 
-/// Returns the report of a run in a frame, and its part `lag`.
+/// Returns the report of a run in a frame. Above it is the part `lag`, a note that is shown while the report is out of date.
 fn report_frame(relative: &RelativePath, update: &Update) -> Markup {
     let report = format!("/report/{}", relative.encode());
     html! {
