@@ -13,8 +13,8 @@ use rand_chacha::rand_core::{Rng, SeedableRng};
 
 /// The default number of mutated inputs for each target. The environment variable `PERTURB_FUZZ_INPUTS` changes it.
 const DEFAULT_INPUTS: u64 = 200;
-/// The environment variable with the maximum memory growth after the first tenth of the inputs, in MB. It needs a
-/// process that runs nothing else: `make attack-test`.
+/// The environment variable with the maximum growth of memory after the first tenth of the inputs, in MB. The limit is
+/// only meaningful in a process that runs no other tests, as in `make attack-test`.
 const MAX_GROWTH_VARIABLE: &str = "PERTURB_FUZZ_MOST_GROWN_MB";
 
 /// The seed of each target's current input.
@@ -96,7 +96,7 @@ fn mutated(inputs: &[Vec<u8>], random: &mut ChaCha8Rng) -> Vec<u8> {
     input
 }
 
-/// Checks that the valid inputs are really valid: mutations of an input that the server rejects at once would test
+/// Checks that the server accepts the valid inputs. Mutations of an input that the server rejects at once would test
 /// little.
 #[test]
 fn seeds_of_sessions_are_answered_without_a_refusal() {

@@ -41,7 +41,7 @@ fn checkpoint(seed: u64, iterations: u64) -> Checkpoint {
     Checkpoint { state, policy, weights }
 }
 
-/// Returns the policy files of the repository, which the learner wrote.
+/// Returns the paths of all trained policies in the repository.
 fn shipped() -> impl Iterator<Item = PathBuf> {
     let policies = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../results/policies");
     files::list(&policies).unwrap().into_iter()
@@ -165,7 +165,8 @@ fn damage_is_named() {
     assert!(spoil("checkpoint", &statistics).contains("observation_normaliser: there is none"));
 }
 
-/// The JSON document must be protected too: for instance, the normalisers' statistics are in no other file.
+/// A change of any byte of the JSON document must be noticed, because for instance the normalisers' statistics are in
+/// no other file.
 #[test]
 fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
     let directory = tempfile::tempdir().unwrap();
@@ -179,14 +180,16 @@ fn no_byte_of_the_json_changes_a_checkpoint_unnoticed() {
         other[at] ^= 1;
         fs::write(&path, other).unwrap();
         match Checkpoint::load(directory.path()) {
-            // Accepted changes are a space, and a last digit that rounds to the same number.
+            // A change is accepted if it has no effect, such as a changed space, or a last digit that rounds to the
+            // same number.
             Ok(loaded) => assert!(loaded == saved, "byte {at}, {:?}", text[at] as char),
             Err(_) => refused += 1,
         }
     }
     assert!(refused > text.len() / 2, "{refused} of {}", text.len());
 
-    // A missing checksum is an error, and so is an earlier format with a checksum.
+    // A document of the current format without a checksum is an error. A document of an earlier format with a checksum
+    // is an error, too.
     let mut document: serde_json::Value = serde_json::from_slice(&text).unwrap();
     document["format_version"] = 2.into();
     fs::write(&path, document.to_string()).unwrap();

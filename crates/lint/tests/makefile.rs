@@ -3,7 +3,8 @@
 use perturb_lint::source::SourceTree;
 use std::path::Path;
 
-/// Returns the names by which a command `cargo test` selects tests: modules, which end in `::`, and parts of names.
+/// Returns the filters by which a command `cargo test` selects tests: names of modules, which end in `::`, and parts of
+/// tests' names.
 fn test_filters(command: &str) -> Vec<&str> {
     let arguments = command.split(&['&', '|', ';'][..]).next().unwrap_or_default();
     let is_filter = |word: &str| word.bytes().all(|byte| byte.is_ascii_lowercase() || b"_:".contains(&byte));

@@ -1,6 +1,6 @@
 // Forward kinematics of hinges and slides. The order of floating-point operations is MuJoCo's, so the results have the
-// same bytes. Where MuJoCo skips a rotation by the identity, this code skips it too, because it could change the sign
-// of a zero.
+// same bytes. If MuJoCo skips a rotation by the identity, this code also skips it, because a rotation could change the
+// sign of a zero.
 //
 // Shapes: vectors [3], quaternions [4] with w first, matrices [3, 3] row-major, motions [6] with rotation first.
 #include "kinematics.h"
@@ -129,7 +129,7 @@ static inline void attach(const mjData* d, int body, mjtByte same, const mjtNum*
   matrix(rotation, turned);
 }
 
-// Whether this file can compute the kinematics of the model.
+// Returns whether this file can compute the kinematics of the model. Other models are left to MuJoCo.
 static int is_walked(const mjModel* m) {
   if (m->nsite || m->nmocap) return 0;
   for (int joint = 0; joint < m->njnt; joint++) {

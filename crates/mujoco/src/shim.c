@@ -1,6 +1,6 @@
 // Calls MuJoCo so that a fatal error does not end the process. By default MuJoCo prints the error, waits for a key and
-// ends the process. Here each call that may fail runs under a thread-local error handler that jumps back to this file.
-// The jump crosses only C frames.
+// ends the process. In this file each call that may fail runs under a thread-local error handler that jumps back to the
+// call in this file. The jump crosses only C frames.
 #include "shim.h"
 
 #include <math.h>
@@ -31,8 +31,8 @@ static void ignore_warning(const char* message) {
   (void)message;  // MuJoCo counts the warning in mjData.warning, which the Rust code reads
 }
 
-// Runs `statement` under the error handler. Afterwards `failed` is 1 if it raised an error. Local variables that
-// `statement` writes must be volatile, because other variables are undefined after the jump.
+// Runs `statement` under the error handler. Afterwards `failed` is 1 if `statement` raised an error. Local variables
+// that `statement` writes must be volatile, because other variables are undefined after the jump.
 #define GUARDED(statement)                                \
   volatile int failed = 0;                                \
   jmp_buf here;                                           \
@@ -47,8 +47,8 @@ static void ignore_warning(const char* message) {
   _mjPRIVATE__set_tls_error_fn(previous);                 \
   landing = NULL;
 
-// Handles a fatal error outside of GUARDED, which the MJCF compiler may raise. Unlike MuJoCo's own handler, it neither
-// writes a log file nor waits for a key.
+// Handles a fatal error outside of GUARDED, such as an error in the MJCF compiler. Unlike MuJoCo's own handler, this
+// function neither writes a log file nor waits for a key.
 static void end_process(const char* message) {
   fprintf(stderr, "MuJoCo: %s\n", message);
   fflush(stderr);
@@ -81,7 +81,8 @@ mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char*
     vfs->filesize[at] = sizes[i];
     vfs->filedata[at] = (void*)data[i];
   }
-  // Not guarded: the loader is C++, whose frames no jump may cross. It catches errors of the engine itself.
+  // This call is not in GUARDED, because the loader is C++, and no jump may cross frames of C++. The loader itself
+  // catches errors of the engine.
   mjModel* model = mj_loadXML("model.xml", vfs, error, error_size);
   mj_freeLastXML();
   free(vfs);
@@ -140,7 +141,7 @@ struct perturb_mj_pairs {
   int geoms[];   // each pair's geom of higher priority, whose contact parameters hold; then the index arrays of `view`
 };
 
-// Whether two geoms can touch, by MuJoCo's rules for geoms that the model does not declare as a pair.
+// Returns whether two geoms can touch, by MuJoCo's rules for geoms that the model does not declare as a pair.
 static int can_touch(const mjModel* m, int a, int b) {
   return ((m->geom_contype[a] & m->geom_conaffinity[b]) || (m->geom_contype[b] & m->geom_conaffinity[a])) &&
          m->body_weldid[m->geom_bodyid[a]] != m->body_weldid[m->geom_bodyid[b]];
@@ -214,7 +215,8 @@ static void collide(const mjModel* model, perturb_mj_pairs* pairs, mjData* data)
   mj_collision(&pairs->view, data);
 }
 
-// Does the same as mj_checkPos and mj_checkVel. It is faster, because they call a function for each number.
+// Does the same as mj_checkPos and mj_checkVel. It is faster, because MuJoCo's functions call another function for each
+// number.
 static void check(const mjModel* m, mjData* d) {
   int good = 1;
   for (int i = 0; i < m->nq; i++) good &= fabs(d->qpos[i]) <= mjMAXVAL;
@@ -275,7 +277,7 @@ int perturb_mjv_make_scene(const mjModel* model, mjvScene* scene, int most_geoms
 int perturb_mjv_update_scene(const mjModel* model, mjData* data, const mjvOption* option, mjvCamera* camera,
                              mjvScene* scene) {
   // The camera is moved first. mjv_updateScene alone would put the headlight at the camera's previous position, so a
-  // picture would depend on the previous one.
+  // picture would depend on the picture before.
   GUARDED(mjv_updateCamera(model, data, camera, scene);
           mjv_updateScene(model, data, option, NULL, camera, mjCAT_ALL, scene))
   return failed;

@@ -18,17 +18,17 @@ const char* perturb_mj_last_error(void);
 mjModel* perturb_mj_load(const char* xml, int xml_size, int n_files, const char* const* names, const void* const* data,
                          const int* sizes, char* error, int error_size);
 
-// Return NULL on failure.
+// Return a copy of a model, and new data for a model. Both return NULL on failure.
 mjModel* perturb_mj_copy_model(const mjModel* source);
 mjData* perturb_mj_make_data(const mjModel* model);
 
-// Returns whether all sizes of two models are equal.
+// Returns 1 if all sizes of two models are equal, otherwise 0.
 int perturb_mj_same_sizes(const mjModel* a, const mjModel* b);
 // Copies `source` into `model`, which must have the same sizes. The arrays of `model` do not move. Returns nonzero on
 // failure.
 int perturb_mj_set_model(mjModel* model, const mjModel* source);
 
-// Each calls the MuJoCo function of the same name, and returns nonzero on failure.
+// Each function calls MuJoCo's function for the same purpose, such as mj_setConst, and returns nonzero on failure.
 int perturb_mj_set_const(mjModel* model, mjData* data);
 int perturb_mj_reset(const mjModel* model, mjData* data);
 int perturb_mj_step1(const mjModel* model, mjData* data);

@@ -1,7 +1,7 @@
 //! Tests leases over a connection that is randomly cut or delayed, in simulated time.
 //!
-//! The environment variable `PERTURB_SEED` sets the first seed, `PERTURB_SIMULATIONS` the number of seeds. A failure
-//! prints its seed.
+//! The environment variable `PERTURB_SEED` sets the first seed, and `PERTURB_SIMULATIONS` sets the number of seeds. A
+//! failed test prints the seed of the failure.
 
 use std::cell::RefCell;
 use std::panic::{AssertUnwindSafe, catch_unwind, resume_unwind};
@@ -33,7 +33,7 @@ fn number(name: &str, default: u64) -> u64 {
     std::env::var(name).map_or(default, |text| text.parse().expect("a number"))
 }
 
-/// Calls `simulate` with each seed. Prints the seed of a failure.
+/// Calls `simulate` with each seed. If it panics, prints the seed.
 fn simulations(simulate: impl Fn(u64)) {
     let first = number(SEED_VARIABLE, 1);
     for seed in first..first + number("PERTURB_SIMULATIONS", SIMULATIONS) {
@@ -89,7 +89,8 @@ async fn play(seed: u64, replies: Replies) -> turmoil::Result {
 }
 
 /// Runs the simulation until the client ends, and interrupts the network at random. Returns whether the client's last
-/// message certainly arrived. A recent interruption that neither side noticed may have lost it.
+/// message certainly arrived. The message may be lost if the network was interrupted shortly before and neither side
+/// noticed.
 fn disturb(simulation: &mut Sim<'_>, seed: u64) -> bool {
     let mut rng = SeededRng::from_seed(!seed);
     let mut change = Duration::from_secs(1);
@@ -128,7 +129,7 @@ fn disturbed(seed: u64) -> (Vec<(Duration, [u64; 2])>, u64) {
     assert_eq!(ledger.done(), (0..STEPS).collect::<Vec<_>>(), "each step is done once, in its order");
     let numbers: Vec<_> = replies.borrow().iter().map(|(_, numbers)| *numbers).collect();
     assert_eq!(numbers, (0..STEPS).map(|step| [step, step + 1]).collect::<Vec<_>>(), "and each reply comes once");
-    // The client has closed the session. If that message was lost, the session ends when its lease ends.
+    // The client has closed the session. If its last message was lost, the server ends the session when the lease ends.
     let timeout = Duration::from_secs(5) + if is_heard { Duration::ZERO } else { LEASE };
     let end = simulation.elapsed() + timeout;
     while simulation.elapsed() < end {

@@ -122,7 +122,7 @@ fn a_wrong_model_is_refused_with_mujocos_reason() {
     assert!(reason("<mujoco><wheel/></mujoco>").contains("wheel"));
     assert!(!reason("no xml").is_empty());
     assert!(!reason("").is_empty());
-    // The engine raises a fatal error while the compiler runs.
+    // With such a small stack, the engine already raises a fatal error while the compiler runs.
     assert!(reason(&SMALL_STACK.replace("500", "1")).contains("Stack overflow"));
 }
 

@@ -29,7 +29,7 @@ fn a_mesh_comes_from_the_given_bytes() {
     let model = Model::from_files(MODEL, &[("other.stl", b"unused"), ("m0.stl", &mesh)]).unwrap();
     let body = model.id(Kind::Body, "corner").unwrap();
     let volume = model.body_mass()[body] / 1000.0;
-    // MuJoCo stores the vertices as float32, relative to the centre of mass, so the results have some eight exact
+    // MuJoCo stores the vertices as float32, relative to the centre of mass. The volume therefore has about eight exact
     // digits.
     assert!((volume - 1.0 / 6.0).abs() < 1e-8, "{volume} m³");
 }

@@ -87,7 +87,8 @@ fn compare(xml: &str) -> usize {
                 qvel.for_each(|(velocity, scale)| *velocity = scale * f64::from(turn / 200) * 0.1);
             }
         }
-        // New simulations compute the poses, because both functions normalise the quaternions of the state in place.
+        // Two other simulations compute the poses, each from a copy of the state, because both functions normalise the
+        // quaternions in place.
         for simulation in &mut seen {
             simulation.set_state(&state(&own)).unwrap();
         }
@@ -126,13 +127,13 @@ fn what_is_not_walked_is_mujocos() {
     };
     let swing = r#"<joint type="hinge" axis="0 0 1"/>"#;
     let ball = with(swing, r#"<joint type="ball"/>"#);
-    // An actuator at a site needs the site's position, …
+    // An actuator at a site needs the position of the site.
     let site = with(r#"<geom type="box" size=".02"#, r#"<site name="grip" pos=".1 0 0"/><geom type="box" size=".02"#)
         .replace(
             "<actuator>",
             r#"<actuator><general site="grip" gear="1 2 3 0 1 0" biastype="affine" biasprm="0.3 0 0"/>"#,
         );
-    // … and a weld to a mocap body needs that body's pose.
+    // A weld constraint to a mocap body needs the pose of the mocap body.
     let hand = with("<worldbody>", r#"<worldbody><body name="led" mocap="true" pos="0.1 0.2 1" quat="1 0.2 0 0"/>"#)
         .replace("<actuator>", r#"<equality><weld body1="led" body2="trunk"/></equality><actuator>"#);
     let tendon = with(swing, r#"<joint name="swing" type="hinge" axis="0 0 1"/>"#).replace(

@@ -31,7 +31,8 @@ fn simulation(xml: &str) -> Simulation {
     Simulation::new(Model::from_xml(xml).unwrap()).unwrap()
 }
 
-/// Steps both simulations, changes the friction now and then, and compares the states. Returns the number of contacts.
+/// Steps two simulations of a model, one with and one without the search. Changes the friction now and then, and
+/// compares the states. Returns the number of contacts.
 fn compare(xml: &str, speed: f64) -> usize {
     let (mut own, mut mujoco) = (simulation(xml), simulation(xml));
     let mut touched = 0;

@@ -81,7 +81,7 @@ fn states_in_one_simulation_evolve_as_each_alone() {
         }
         *own = state(&shared);
         assert_eq!(*own, state(&alone[number]), "number {number} in turn {turn}");
-        // A divergence or an edit in between must have no effect.
+        // A divergence or an edit between two states must have no effect.
         if turn % 5 == 0 {
             shared.qvel_mut()[0] = f64::NAN;
             assert_eq!(shared.step(), Err(Error::Diverged { warning: Warning::BadVelocity }));

@@ -17,7 +17,8 @@ const OBJECTIVE: Objective = Objective {
     kl_coef: 0.0,
 };
 
-/// Returns a differentiator with the activations that an actor cached for `observations`, and the weights.
+/// Returns a differentiator that took over the activations that an actor cached for `observations`. Also returns the
+/// weights `[P]`.
 fn taken(observations: &[f32]) -> (Differentiator, Vec<f32>) {
     let spec = PolicySpec::feed_forward(O, ACTION);
     let weights: Vec<f32> = (0..spec.n_weights()).map(|i| 0.01 * (i % 7) as f32 - 0.03).collect();

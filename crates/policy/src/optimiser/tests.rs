@@ -18,8 +18,8 @@ fn gradients_are_clipped_by_global_norm() {
     }
 }
 
-/// Expected values are five steps computed with numpy (`crates/torch/tests/fixtures/make_losses.py`). The ε is so large
-/// that it matters whether it is inside or outside of the root.
+/// The expected weights after five steps were computed with numpy (`crates/torch/tests/fixtures/make_losses.py`). The ε
+/// is so large that it matters whether it is inside or outside of the root.
 #[test]
 fn steps_agree_with_numpy() {
     let cases: serde_json::Value =

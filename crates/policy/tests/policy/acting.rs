@@ -10,7 +10,7 @@ fn spec(action: ActionKind, hidden: &[usize]) -> PolicySpec {
     PolicySpec { observation_size: 17, action, hidden: hidden.to_vec(), lstm: None }
 }
 
-/// Returns weights that all differ from the initial ones, biases and log_std included, by about 0.1.
+/// Returns weights that differ from the initial weights by about 0.1. Biases and log_std also differ.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
     let mut weights = initial_weights(spec, &mut stream(1, Purpose::Weights));
@@ -108,7 +108,8 @@ fn actions_follow_the_closed_form_of_the_last_layer_alone() {
     weights[1].data = vec![2.0f32.ln(), 0.0, 1.0f32.ln()]; // probabilities ½, ¼, ¼
     let acts = act(&mut actor(&spec, &weights, 20_000), &spec, &vec![0.0; 17 * 20_000], 3);
     let share = |choice: f32| acts.actions.iter().filter(|&&a| a == choice).count() as f64 / 20_000.0;
-    // The tolerance is four standard deviations of a share: 4·√(p(1-p)/20 000).
+    // The tolerance is four standard deviations of the share of an action with probability p in 20 000 draws:
+    // 4·√(p(1-p)/20 000).
     assert!(
         (share(0.0) - 0.5).abs() < 0.0142 && (share(1.0) - 0.25).abs() < 0.0123 && (share(2.0) - 0.25).abs() < 0.0123
     );

@@ -65,8 +65,8 @@ fn the_number_of_threads_changes_no_byte(
     }
 }
 
-/// Acts in N environments for T steps, with fewer observations than the cache holds, exactly as many, and more. Values
-/// are also computed between the steps.
+/// Acts in N environments for T steps. The cases have fewer observations than the cache can hold, exactly as many, and
+/// more. Values of other observations are computed between the steps.
 #[rstest]
 fn cached_activations_give_the_same_gradient(
     #[values(ActionKind::Discrete { n: 2 }, ActionKind::Continuous { size: 3 })] action: ActionKind,
@@ -290,7 +290,7 @@ fn total(spec: &PolicySpec, weights: &[f64], samples: &Samples<'_>, objective: &
 
 #[rstest]
 fn gradients_are_finite_differences(
-    // The second kind of action has more outputs than one lane of the kernel.
+    // With 19 choices, the policy has more outputs than one lane of the kernel, which is 16 numbers.
     #[values(ActionKind::Discrete { n: 3 }, ActionKind::Discrete { n: 19 }, ActionKind::Continuous { size: 2 })]
     action: ActionKind,
     #[values(&[], &[7], &[5, 18])] hidden: &[usize],
@@ -337,8 +337,8 @@ fn gradients_are_finite_differences(
         distance += (slope - f64::from(got)).powi(2);
         size += slope * slope;
     }
-    // The tolerance covers the rounding of f32 sums. A larger difference would appear if the loss had a kink within
-    // 1e-6 of a weight.
+    // The tolerance covers the rounding of f32 sums. The difference would be larger if the derivative of the loss
+    // jumped within 1e-6 of a weight.
     assert!(distance.sqrt() < 1e-5 * size.sqrt(), "off by {:e} of {:e}", distance.sqrt(), size.sqrt());
 }
 

@@ -36,7 +36,7 @@ proptest! {
             merged.merge(&parts[order[2]]).expect("the same size");
             for got in [in_order.moments(), &merged] {
                 prop_assert_eq!(got.count(), numbers.len() as u64);
-                // The tolerance covers the f64 rounding of 200 numbers up to 1100, and of their squares.
+                // The tolerance covers the rounding in f64 of sums over 200 numbers up to 1100, and over their squares.
                 prop_assert!((got.mean()[0] - mean).abs() < 1e-10);
                 prop_assert!((got.variance(0) - variance).abs() < 1e-7);
             }

@@ -37,8 +37,8 @@ fn step(player: &mut Player, t: u64, episodes_per_trial: u32, reward: f32) {
     player.observe(&outcome, None).expect("numbers that fit");
 }
 
-/// Checks the discounted return after each of five steps with reward 1, and after the reset that begins EPOpt's next
-/// iteration.
+/// Checks the discounted return after each of five steps with reward 1, and after the reset at the start of EPOpt's
+/// next iteration.
 #[rstest]
 #[case::an_episode(1, false, [1.0, 0.0, 1.0, 0.0, 1.0, 0.0])]
 #[case::a_trial(2, false, [1.0, 1.5, 1.75, 0.0, 1.0, 0.0])]
@@ -140,11 +140,11 @@ fn noise_continues_from_a_saved_state() {
     }
 }
 
-/// While a policy is being tested, the normalisers' statistics are not updated. Rewards are still normalised with them,
-/// whereas the code of Packer et al. (2018) gives an RL² policy raw rewards when testing it.
+/// While a policy is being tested, the normalisers' statistics are not updated. Rewards are still normalised with these
+/// statistics. In contrast, the code of Packer et al. (2018) gives raw rewards to an RL² policy in tests.
 #[test]
 fn tests_leave_statistics_unchanged() {
-    // Means of 1 and variances of 4 and 100.
+    // The means are 1. The variances are 4 for observations and 100 for returns.
     let moments = |squares: f64| RunningMoments::from_parts(2, vec![1.0], vec![squares]);
     let normalisers = Normalisers {
         observations: Some(ObservationNormaliser::from_moments(moments(8.0))),

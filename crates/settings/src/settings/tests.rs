@@ -126,8 +126,8 @@ fn the_presets_differ_in_named_settings_and_in_nothing_else() {
     }
 }
 
-/// Checks the values in both columns of the table in docs/algorithms.md. The test above checks only which settings
-/// differ.
+/// Checks the values of both presets in the table in docs/algorithms.md. The previous test checks only the list of
+/// settings that differ.
 #[test]
 fn each_preset_has_the_documents_values() {
     let (ff, rc) = (Architecture::Ff, Architecture::Rc);
@@ -160,7 +160,7 @@ fn each_preset_has_the_documents_values() {
         let of_epopt = |values: [Value; 2]| algorithm.starts_with("epopt").then_some(values);
         has("rank_by", of_epopt(["raw", "normalized"].map(Value::from)));
         has("update_per_episode", of_epopt([false, architecture == rc].map(Value::from)));
-        // The code of Packer et al. (2018) has this penalty but does not apply it.
+        // The code of Packer et al. (2018) has a setting for the KL penalty but never applies the penalty.
         let penalty = if algorithm == "rl2-ppo" { 0.2 } else { 0.0 };
         has("kl_coef", n_epochs.map(|_| [penalty, penalty].map(Value::from)));
     }
