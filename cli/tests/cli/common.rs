@@ -58,7 +58,8 @@ pub fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// Waits until a server listens at `socket`. The socket's file exists a moment earlier.
+/// Waits until a server accepts connections at `socket`. The existence of the file is not enough, because it exists a
+/// moment earlier.
 pub fn wait_for_server(socket: &Path) {
     wait_for("a server", || UnixStream::connect(socket).is_ok());
 }

@@ -129,7 +129,8 @@ fn pendulums() -> OpenOptions {
     }
 }
 
-/// Pendulum's episodes have 200 steps, so that two rollouts of 150 hold one end, and begin in the middle of an episode.
+/// Collects two rollouts of 150 steps. An episode of Pendulum has 200 steps, so the second rollout begins in the middle
+/// of an episode and contains the end of it.
 fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
     let mut observations = Vec::new();
     let mut session = Session::open(servers, &pendulums(), &mut observations).expect("a session");
@@ -199,8 +200,9 @@ fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
     assert!(close(&got[49 * N_ENVS..50 * N_ENVS], &expected[200 * N_ENVS..]), "{got:?}");
 }
 
-/// An LSTM of one cell that counts the steps: to the left in the first five, then to the right until the pole falls.
-/// A policy that remembers the previous episode goes right at once, which ends sooner.
+/// The policy is an LSTM with one cell that counts steps. It pushes to the left in the first five steps, and then to
+/// the right until the pole falls. If it still remembered the previous episode, it would push to the right from the
+/// first step, and the episode would be shorter.
 #[test]
 fn every_test_episode_begins_without_memories() {
     let server = [server(1)];
@@ -226,7 +228,7 @@ fn every_test_episode_begins_without_memories() {
     };
     let first_episodes = length(100);
     let ten_of_each = length(1000);
-    // Lengths differ by the start of an episode, by about 1; means of 100 by a tenth of that.
+    // Random initial states change the length of an episode by about 1 step, and a mean of 100 lengths by 0.1.
     assert!((first_episodes - ten_of_each).abs() < 0.5, "{first_episodes} {ten_of_each}");
 }
 
@@ -389,7 +391,7 @@ fn a_closed_pipe_ends_the_program_quietly() {
     assert!(Path::new(json).exists(), "the file was asked for");
 }
 
-/// A server that asks every second whether its learner lives, and gives it a second to answer.
+/// The server pings its client every second, and ends the connection if no answer comes within a second.
 #[test]
 fn a_server_keeps_a_learner_that_computes_for_long() {
     let directory = tempfile::tempdir().expect("a directory");

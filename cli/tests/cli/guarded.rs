@@ -28,7 +28,7 @@ pub struct Has {
     token: Option<&'static str>,
 }
 
-/// Returns valid credentials.
+/// Valid credentials, with all that the server requires.
 pub const ALL: Has = Has { ca: "ca.pem", cert: Some("client"), token: Some("token") };
 
 const TOKENS: &str = "

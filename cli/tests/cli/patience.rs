@@ -119,7 +119,8 @@ fn harassed(text: &str, victim: Victim, most: usize, dice: &mut SeededRng) -> (u
         Victim::Private => train(&folder, text, &["--workers", "1"]),
         Victim::Named | Victim::OneOfTwo => train(&folder, text, &["--server", &list]),
     };
-    // Before the training begins, a server that does not answer counts as a wrong address.
+    // Wait for the training to begin. Before that, a server that does not answer counts as a wrong address and ends the
+    // program.
     wait_for("a training", || out.join("progress.csv").exists());
     let mut kills = 0;
     while kills < most {

@@ -237,7 +237,7 @@ fn the_demo_compares_with_the_paper() {
     assert!(config.contains("version = \"R\"") && config.contains("learning_rate = 0.003"), "{config}");
     let picture = std::fs::read(folder.path().join("demo/heatmap.png")).expect("a picture");
     assert!(picture.starts_with(b"\x89PNG"));
-    // No policy balances the pole after twenty episodes.
+    // After twenty training episodes no policy balances the pole, so the demo has a failure to film.
     assert!(text.contains("failure.gif") && folder.path().join("demo/failure.gif").exists(), "{text}");
 }
 

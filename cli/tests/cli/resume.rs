@@ -276,7 +276,7 @@ fn old_formats_load_and_other_revisions_are_refused() {
     let advice = "resume with the version of perturb-server that it began with, or train again";
     assert_eq!(error, format!("the run was {revisions}; {advice}"));
 
-    // With the present revision the checkpoint could be tested.
+    // If the document had the present revision, the checkpoint could be tested.
     edit(out.path(), "/environment_spec/revision", 1.into());
     let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
     let tester = Tester::new(&servers, &checkpoint, options).expect("the environment is the same");

@@ -92,7 +92,7 @@ fn shutting_down(with_session: impl FnOnce(&Address)) {
     let directory = tempfile::tempdir().expect("a directory");
     let socket = directory.path().join("socket");
     let address: Address = format!("unix:{}", socket.display()).parse().expect("an address");
-    // The server is not a private one, because that would end too soon.
+    // The test starts perturb-server itself, because a private server would end too soon.
     let program = Path::new(env!("CARGO_BIN_EXE_perturb")).with_file_name("perturb-server");
     let mut server = std::process::Command::new(program)
         .args(["--listen", &address.to_string(), "--log", "error", "--grace-seconds", "120"])

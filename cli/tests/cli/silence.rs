@@ -6,7 +6,8 @@ use crate::common::{ended, kill, wait_for};
 use crate::patience::{A2C_PENDULUM, Named, PPO_CART_POLE, result, train, undisturbed};
 use perturb_faults::{FaultPlan, FaultyProxy, SeededRng};
 
-/// Stops a server, and waits until all its threads are stopped. Before that it may still answer.
+/// Sends SIGSTOP to a server, and waits until all its threads are stopped. A server with running threads may still
+/// answer.
 fn freeze(server: &Named) {
     kill("-STOP", server.id());
     let is_stopped = |task: std::io::Result<std::fs::DirEntry>| {
@@ -48,7 +49,7 @@ fn a_briefly_silent_server_is_waited_for(#[case] text: &str, #[case] names: &[&s
     assert_eq!(result(&out), undisturbed(text), "after {stops} stops");
 }
 
-/// The server listens on TCP, because only there do sessions have leases.
+/// The client connects over TCP, because sessions over Unix sockets have no leases.
 #[test]
 fn a_session_resumes_when_a_silent_server_answers_again() {
     let folder = tempfile::tempdir().expect("a directory");

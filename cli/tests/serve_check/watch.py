@@ -212,7 +212,7 @@ def watch_training(pages):
 
 
 def watch_curves(pages):
-    """Two trainings in the same charts, chosen in the list."""
+    """Selects two trainings in the list, and checks the page that draws both in the same charts."""
     link = "document.getElementById('charted')"
     pages.check("a link before a choice", pages.evaluate(f"{link}.parentElement.hidden"), True)
     pages.evaluate("document.querySelectorAll('input[name=charted]').forEach(input => input.click())")
@@ -234,7 +234,7 @@ def watch_experiment(pages, experiment):
     pages.open("run/study")
     pages.until("a cell in work", "document.querySelectorAll('.working tbody tr').length > 0")
     pages.until("its curve", "document.querySelector('[data-chart=cells]').dataset.points > 1")
-    # Between two cells there may be no line for a moment, so the check waits for it.
+    # The plot has no line for a moment between the end of a cell and the start of the next, so wait for a line.
     pages.until("its line", f"{PAINTED}.some(([plot, count]) => plot === 'cells' && count >= {LEAST_LINE})")
     pages.draw("experiment", None, schemes=("light",))
     pages.until("a link to its training", "document.querySelector('.map li.in-work a') !== null")

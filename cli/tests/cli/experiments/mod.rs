@@ -120,7 +120,7 @@ fn children(parent: u32) -> Vec<u32> {
 
 /// Kills a run with SIGKILL, and waits until all its processes have ended.
 fn kill_all(mut child: Child) {
-    // Between two worker processes there may be no child for a moment.
+    // The list may be empty, because the run may be between two worker processes.
     let started = children(child.id());
     kill("-KILL", child.id());
     assert_eq!(child.wait().expect("ended").signal(), Some(9), "killed before its end");

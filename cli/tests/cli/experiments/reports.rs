@@ -283,7 +283,7 @@ fn heatmaps_of_an_experiment_are_made_once() {
         assert_eq!(text(&picture.with_extension("csv")).lines().count(), 9, "two columns of four points");
     }
 
-    // Heatmaps with damaged files are made again, and so are heatmaps of a replaced result.
+    // A heatmap is made again if its file is damaged, or if the result of its cell was replaced.
     let damaged = first.keys().find(|path| path.extension().is_some_and(|ending| ending == "csv")).expect("one");
     std::fs::write(damaged, b"mass,").expect("written");
     assert!(experiment.page("out").contains("not there: 1 of 8."));
@@ -371,7 +371,8 @@ fn curves_of_two_learners_are_drawn_and_written() {
     let table = std::fs::read_to_string(report.join("curves.csv")).expect("a table");
     let lines_of = |name: &str| table.lines().filter(|line| line.contains(name)).count();
     assert!(lines_of("a2c") >= 2 && lines_of("a2c") == lines_of("ppo"), "{table}");
-    // As in somebody else's experiment: not even root can write here.
+    // Replace the report's folder by a link to a folder in which not even root can write, as in an experiment of
+    // another user.
     std::fs::remove_dir_all(&report).expect("removed");
     std::os::unix::fs::symlink("/proc", &report).expect("a link");
     for name in ["report", "curves"] {
