@@ -75,14 +75,14 @@ def find_server(clone: Path) -> str:
 
 
 def ask_catalogue(server: str, version: str) -> str:
-    """Return the JSON text with environments and limits that perturb-server prints, and check its version."""
-    asked = subprocess.run([server, "--catalogue"], capture_output=True, text=True, check=False)
-    if asked.returncode != 0:
-        raise RuntimeError(f"{server} --catalogue ended with status {asked.returncode}: {asked.stderr}; {REMEDY}")
+    """Return the JSON text with environments and limits that perturb-server prints. Check the server's version."""
+    finished = subprocess.run([server, "--catalogue"], capture_output=True, text=True, check=False)
+    if finished.returncode != 0:
+        raise RuntimeError(f"{server} --catalogue ended with status {finished.returncode}: {finished.stderr}; {REMEDY}")
     try:
-        served = json.loads(asked.stdout)["server_version"]
+        served = json.loads(finished.stdout)["server_version"]
     except (ValueError, KeyError) as error:
         raise RuntimeError(f"{server} --catalogue printed no catalogue; {REMEDY}") from error
     if served != version:
         raise RuntimeError(f"{server} has the version {served}, this package {version}; {REMEDY}")
-    return asked.stdout
+    return finished.stdout

@@ -150,9 +150,9 @@ def contenders(case: Case, server: str | None) -> dict[str, Contender]:
 
 
 def rate(contender: Contender, actions: Any, seconds: float) -> tuple[float, int]:
-    """Step a contender for some seconds. Return its steps per second, summed over environments, and the ended episodes.
+    """Step a contender for some seconds, with `actions` of 64 steps, [64, N] or [64, N, A], again and again.
 
-    `actions`, [64, N] or [64, N, A], are the actions of 64 steps, which are repeated.
+    Return the steps per second, summed over environments, and the number of ended episodes.
     """
     steps = ended = 0
     rows = list(actions.astype(contender.kind))

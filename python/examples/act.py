@@ -2,7 +2,7 @@
 
 A feed-forward policy of random weights plays 200 steps in each of 8 CartPoles, in one round trip. Then this script
 computes its values and log-probabilities again, with NumPy. docs/rollouts.md says what the arrays hold.
-Run, with grpcio-tools: perturb-server, and beside it: python act.py [--server unix:/path]
+Needs grpcio-tools. Start perturb-server, and then run: python act.py [--server unix:/path]
 """
 
 import argparse

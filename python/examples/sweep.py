@@ -1,6 +1,6 @@
 """A simple policy on poles of many lengths, in one batch with a different length in each environment.
 
-Each environment of a batch may have its own parameters: select it by a mask at a reset. All begin in the same state.
+A reset with a mask sets the parameters of the selected environments only. All poles begin in the same state.
 Needs only the package. Run: python sweep.py [--server unix:/path]
 """
 

@@ -69,7 +69,7 @@ impl NativeServer {
         Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
     }
 
-    /// Ends the server's threads. Close its sessions first.
+    /// Ends the server's threads. The caller must close all sessions of the server first.
     fn close(&self, py: Python<'_>) {
         if std::process::id() == self.owner {
             let server = self.server.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -79,7 +79,7 @@ impl NativeServer {
 }
 
 impl NativeServer {
-    /// Returns a reference to the server that does not keep it alive.
+    /// Returns a weak reference, which does not keep the server alive.
     pub fn handle(&self) -> Weak<server::EmbeddedServer> {
         self.server.lock().unwrap_or_else(PoisonError::into_inner).as_ref().map(Arc::downgrade).unwrap_or_default()
     }

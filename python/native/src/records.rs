@@ -244,7 +244,7 @@ pub fn wilson(successes: u64, episodes: u64) -> (f64, f64) {
 }
 
 /// Returns the metrics Default, Interpolation and Extrapolation, %. `rates` has the success rates, %, by scenario, such
-/// as "DR". A metric is `None` if one of its scenarios is missing.
+/// as "DR" (trained on D, tested on R). A metric is `None` if one of its scenarios is missing.
 #[pyfunction]
 pub fn metrics(rates: std::collections::HashMap<String, f64>) -> (Option<f64>, Option<f64>, Option<f64>) {
     let [default, interpolation, extrapolation] =

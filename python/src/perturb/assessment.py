@@ -87,8 +87,8 @@ class Assessment:
         """The three metrics of Packer et al. (2018, arXiv:1810.12282), in %, by name.
 
         In a scenario such as DR, the policy was trained on D and tested on R. `Default` is the success rate of DD, and
-        `Interpolation` that of RR. `Extrapolation` is the geometric mean of the success rates of DR, DE and RE. A metric
-        is None if one of its scenarios was not tested.
+        `Interpolation` that of RR. `Extrapolation` is the geometric mean of the success rates of DR, DE and RE. A
+        metric is None if one of its scenarios was not tested.
         """
         rates = {result.scenario: result.success_percent for result in self.results if result.trained_on is not None}
         return dict(zip(METRICS, _native.metrics(rates), strict=True))

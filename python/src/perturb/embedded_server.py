@@ -14,9 +14,9 @@ from .local_server import find_program
 if TYPE_CHECKING:
     from .local_server import TaskFolder
 
-# A lock that is held while models are loaded, compiled or drawn, and during a fork. The fork thus waits for this work.
-# Without it, a forked process could inherit locks of the work that no thread releases. A thread that holds the lock of
-# `local_server` must not wait for this lock.
+# A lock that is held while models are loaded, compiled or drawn, and during a fork. A fork thus waits for this work.
+# Otherwise the forked process could inherit locks that the work holds and that no thread releases. A thread that holds
+# the lock of `local_server` must not wait for this lock.
 loading = threading.RLock()
 
 
@@ -39,7 +39,7 @@ class EmbeddedServer:
             raise ServerStartError(f"the embedded server did not start: {words}") from None
 
     def end(self) -> None:
-        """End the server's threads. Close its sessions first."""
+        """End the server's threads. The caller must close all sessions of the server first."""
         self.native.close()
 
     def exit_status(self) -> int | None:

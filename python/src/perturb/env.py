@@ -182,7 +182,7 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
     def restore(self, snapshot: bytes) -> NDArray[np.float32]:
         """Restore a snapshot, which may be from another process. Return the observation at which it was saved.
 
-        The same actions then give the same bytes as after the snapshot.
+        From then on, the same actions give the same bytes as after the snapshot was saved.
         """
         self._client.open([], self.np_random)
         observation: NDArray[np.float32] = self._client.restore([snapshot], None)[0]

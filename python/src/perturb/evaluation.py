@@ -81,8 +81,8 @@ def evaluate(
         contexts: adds a test called `contexts`, on this list of contexts. A context is a mapping from names of
             parameters to values.
         base: the version of all parameters that `parameters` or `contexts` do not name.
-        trained_on: the version that the policy was trained on, for the names of its scenarios. Leave it out for a
-            policy of `load_policy`, which knows its version.
+        trained_on: the version that the policy was trained on. It becomes part of the names of scenarios, such as `DR`.
+            Leave it out for a policy of `load_policy`, which knows its version.
         success: the success rule. `text` is the environment's rule, which follows the paper's text (default). `code`
             follows the paper's published code. A threshold is a text such as `steps=90`, `return>=300` or `length<=90`.
             A function gets the columns of `Assessment.columns`, arrays [episodes] by name, and returns bool [episodes].

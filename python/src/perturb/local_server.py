@@ -128,7 +128,7 @@ class LocalServer:
         self._wait_until_ready(program)
 
     def end(self) -> None:
-        """End the server and wait until it has ended. Close its sessions first."""
+        """End the server and wait until it has ended. The caller must close all sessions of the server first."""
         # Call the function `_end` directly. The finalizer would do nothing while Python exits and `_at_exit` runs.
         if self._unended.detach() is not None:
             _end(self.process, self._directory, self._owner)
@@ -176,7 +176,7 @@ class OwnServer(Protocol):
     def __init__(self, task: TaskFolder | None = None) -> None: ...
 
     def end(self) -> None:
-        """End the server. Close its sessions first."""
+        """End the server. The caller must close all sessions of the server first."""
 
     def exit_status(self) -> int | None:
         """Return the exit status, or None while the server runs."""

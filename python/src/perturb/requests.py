@@ -91,7 +91,7 @@ def frozen(intervals: Intervals) -> tuple[Any, ...]:
 
 
 def contexts(listed: Any) -> list[dict[str, float]]:
-    """Convert the option `contexts` to a list of contexts. A context has a number for each parameter that it names."""
+    """Convert the option `contexts` to a list of contexts. A context maps names of parameters to numbers."""
     if isinstance(listed, str | Mapping) or not isinstance(listed, Sequence):
         raise InvalidArgumentError(
             f"contexts is {listed!r}; expected a list such as [{{'length': 0.3}}, {{'length': 0.5}}]"

@@ -70,8 +70,8 @@ class Result:
     return_interval: tuple[float, float]
     # The mean length of episodes, in steps.
     mean_length: float
-    # CVaR 10 % (Rockafellar and Uryasev, 2000): the mean of the lowest tenth of returns. A tenth of the number of
-    # episodes is rounded up.
+    # CVaR 10 % (Rockafellar and Uryasev, 2000): the mean of the lowest tenth of returns. If a tenth of the
+    # episodes is not a whole number, it is rounded up.
     cvar_return: float
     # The bootstrap interval of `cvar_return`, from 1000 resamples of the episodes.
     cvar_interval: tuple[float, float]

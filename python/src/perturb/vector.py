@@ -58,9 +58,9 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         render_mode: `rgb_array` to make `render` available, or None.
         width: width of pictures, in pixels.
         height: height of pictures, in pixels.
-        contexts: a list of C contexts, at most N, or a grid or list of `perturb.sets`. A context has a value of each
-            parameter that it names. Environment i has context i modulo C in all episodes. Other parameters come from
-            the version and `parameters`. Parameters of a reset replace those of contexts.
+        contexts: a list of C contexts, at most N, or a grid or list of `perturb.sets`. A context is a mapping from
+            names of parameters to values. Environment i has context i modulo C in all episodes. Other parameters come
+            from the version and `parameters`. Parameters of a reset replace those of contexts.
         max_episode_steps: must be None or the server's step limit. `gymnasium.make_vec` passes it.
 
     The first `reset` connects to the server. Rewards are float32 [N]; terminated and truncated flags are bool [N].
@@ -306,9 +306,9 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         """Restore M snapshots into the environments that the mask [N] selects, by default all.
 
         Returns the observations [N, O]. Restored environments have the observations at which they were saved. Other
-        environments have their last observations. The same actions then give the same bytes as after the snapshot. If
-        one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in total are restored in
-        parts. If one part is refused, the snapshots of the parts before it stay restored.
+        environments have their last observations. From then on, the same actions give the same bytes as after the
+        snapshot was saved. If one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in
+        total are restored in parts. If one part is refused, the snapshots of the parts before it stay restored.
         """
         selected = None
         if mask is not None:

@@ -22,7 +22,7 @@ pub struct Opened {
     pub(super) served: Arc<proto::Environment>,
     pub(super) observations: Bytes,
     pub(super) shape: [usize; 2],
-    /// The first episodes.
+    /// The first episodes, from which the infos of the first reset are made.
     #[pyo3(get)]
     pub(super) events: Py<Events>,
 }
