@@ -189,7 +189,7 @@ fn reward_is_the_sum_of_its_terms() {
         for t in 0..1500 {
             let (outcome, terms) = step(&mut e, &action_bytes(spec, 1, t));
             assert_eq!(terms.len(), spec.reward_terms.len());
-            // Exact: the same numbers are added in the same order.
+            // The sums are exactly equal, because the same numbers are added in the same order.
             assert_eq!(outcome.reward, terms.iter().sum::<f64>(), "{}", spec.name);
             total += outcome.reward;
             if e.ended() {
@@ -283,7 +283,7 @@ fn an_exact_state_gives_the_same_bytes_whatever_ran_before() {
         let mut fresh = episodes(spec, Version::R, 4, 0, 10);
         let mut used = episodes(spec, Version::R, 4, 0, 10);
         play(&mut used, 1, 0, 10);
-        // Both are in the second episode of a trial, so their counts are equal.
+        // Both environments are in the second episode of a trial, so their counts are equal.
         used.begin_trial(Some(4), None, None);
         fresh.begin(Some(&state));
         used.begin(Some(&state));
@@ -419,7 +419,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
             let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             let applied = e.receipt().applied;
-            // Enough steps for every parameter to have an effect, also by contacts with the floor.
+            // 40 steps are enough for an effect of every parameter, also through contacts with the floor.
             let observations: Vec<_> = (0..40)
                 .map(|t| {
                     if !e.ended() {

@@ -1,5 +1,5 @@
-//! What every server of the protocol must do, tested through the protocol only. The server is the one at
-//! PERTURB_ADDRESS, or one that the test starts.
+//! Tests of everything that each server of the protocol must do, through the protocol only. They test the server at the
+//! address PERTURB_ADDRESS if this variable is set, otherwise a server that they start.
 
 use crate::common::server::{self, Actor, Server, Session, action, doubles, floats, open, parameters, stepped};
 use bytes::Bytes;
@@ -230,8 +230,8 @@ struct Seen {
     end: Option<EpisodeEnd>,
 }
 
-/// Plays until every environment has finished `episodes` episodes. Actions depend on environment, episode and step
-/// only.
+/// Plays until every environment has finished `episodes` episodes. An action is a function of environment, episode and
+/// step only.
 async fn episodes(target: &Target, e: &Environment, autoreset: AutoresetMode, episodes: usize) -> Vec<Vec<Seen>> {
     const N: usize = 3;
     let o = 4 * e.observation.len();
@@ -524,8 +524,8 @@ async fn a_restored_environment_goes_on_as_it_did() {
         assert_eq!(other.restore(&[], snapshots.clone()).await, before);
         assert!(other.play(actor, 38, steps).await == after, "{}: in a session opened otherwise", e.name);
 
-        // Restores the environment of slot 0 into slot 2. It keeps its index, and the other environments are
-        // unaffected.
+        // Restores the environment of slot 0 into slot 2. The restored environment keeps its index, and the other
+        // environments are unaffected.
         let (mut moved, opened) = target.open(open(&e.name, N as u32, 4)).await;
         let o = 4 * e.observation.len();
         let restored = moved.restore(&[0, 0, 1], vec![snapshots[0].clone()]).await;

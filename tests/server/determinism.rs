@@ -49,7 +49,7 @@ async fn bytes_depend_neither_on_threads_nor_on_the_transport() {
             assert!(ended >= BATCH as usize, "{name}: only {ended} episodes ended: too little was compared");
             hashes.push((place, hash(&responses)));
         }
-        // Written to standard error directly, because the test harness hides the output of tests that pass.
+        // The line is written to standard error directly, because the test harness hides the output of tests that pass.
         writeln!(std::io::stderr(), "{name}, {STEPS} steps of {BATCH}: SHA-256 {}", hashes[0].1).unwrap();
         assert!(hashes.iter().all(|(_, hash)| *hash == hashes[0].1), "{name}: {hashes:#?}");
     }
@@ -57,7 +57,7 @@ async fn bytes_depend_neither_on_threads_nor_on_the_transport() {
 
 #[tokio::test]
 async fn bytes_do_not_depend_on_how_many_shards_a_batch_has() {
-    // Large enough to be cut into shards, and differently by one and by three workers.
+    // The batch is large enough to be cut into shards, and one worker cuts it differently than three workers.
     const BATCH: u32 = 1200;
     let (one, three) = (Server::with_folders(&["--workers", "1"]), Server::with_folders(&["--workers", "3"]));
     for environment in &catalogue(one.tcp()).await {

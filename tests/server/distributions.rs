@@ -1,4 +1,5 @@
-//! Parameters are drawn as the paper says: D exact, R uniform, E uniform over the union around R; nothing else passes.
+//! Parameters are drawn as the paper says: D is exact, R is uniform, and E is uniform over the two intervals around R.
+//! Other values are refused.
 
 use crate::common;
 use perturb::{
@@ -35,7 +36,7 @@ const DOCUMENT: &[(&str, &str, &str, f64, (f64, f64), [(f64, f64); 2])] = &[
 
 /// The number of trials that are drawn for each test of a distribution.
 const DRAWS: u32 = 4000;
-/// The number of standard deviations beyond which a count fails. By chance this happens once in 1.7 million
+/// The number of standard deviations beyond which a count fails the test. By chance a count fails once in 1.7 million
 /// comparisons, and the seed is fixed.
 const SIGMAS: f64 = 5.0;
 /// The bound of √n times the Kolmogorov-Smirnov distance. By chance it is exceeded with probability 2 exp(-2 · 2.7²) =
@@ -159,7 +160,7 @@ fn parameters_are_drawn_independently() {
         };
         for i in 0..spec.parameters.len() {
             for j in 0..i {
-                // If the two are independent, the mean of the product has standard deviation 1 / (12 √n).
+                // If the two parameters are independent, the mean of the product has standard deviation 1 / (12 √n).
                 let mean = scaled(i).zip(scaled(j)).map(|(a, b)| a * b).sum::<f64>() / f64::from(DRAWS);
                 let sigmas = mean * 12.0 * f64::from(DRAWS).sqrt();
                 assert!(sigmas.abs() < SIGMAS, "{}: parameters {i} and {j}: {sigmas} σ", spec.name);

@@ -107,10 +107,11 @@ fn a_failed_drawing_fails_alone() {
         run(renderer.draw(Scene::Model(PosedModel { look, edited: None, qpos: qpos.to_vec() }), SIZE))
     };
     let expected = draw(look, &qpos).unwrap();
-    // Positions of another robot, which only a defect could cause.
+    // The positions have the length of another robot's, which only a defect could cause.
     assert_eq!(draw(look, &qpos[1..]), Err(Error::Defect));
     assert_eq!(draw(look, &qpos), Ok(expected.clone()));
-    // After a model that cannot be compiled, the thread starts again from scratch, which must not be visible either.
+    // After a model that cannot be compiled, the thread starts again with an empty cache. Later pictures must be equal
+    // nevertheless.
     for (mjcf, words) in [("<mujoco/>", "no end"), ("<mujoco></mujoco>", "torso")] {
         let bad: &'static Look = Box::leak(Box::new(Look { mjcf, ..*look }));
         let Err(Error::Failed { environment: "Hopper", reason }) = draw(bad, &qpos) else { panic!("it was drawn") };

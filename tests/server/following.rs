@@ -42,8 +42,8 @@ async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
     poll_fn(|context| Poll::Ready(future.as_mut().poll(context))).await
 }
 
-/// Starts a step and queues a second one behind it. Returns the result of the first, and whether it was still running
-/// when the second was queued.
+/// Starts a step and queues a second step behind it. Returns the result of the first step, and whether the first step
+/// was still running when the second step was queued.
 async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<StepResult, Error>, bool) {
     let queue = batch.step_queue().unwrap();
     let mut stepping = pin!(batch.step(first));
@@ -56,7 +56,7 @@ async fn followed(batch: &mut Batch, first: &[u8], second: Bytes) -> (Result<Ste
     }
 }
 
-/// Waits until a condition holds that the workers make true.
+/// Waits until the workers have made a condition true.
 async fn wait_until(condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(30);
     while !condition() {
@@ -79,7 +79,7 @@ async fn pipelined_step_runs_early_and_gives_the_same_bytes() {
         let (stepped, was_under_way) = self::followed(&mut batch, &first, second.clone()).await;
         let stepped = stepped.unwrap();
         if was_under_way {
-            // Not if the first step had ended before the second was queued.
+            // The second step does not run if the first step had ended before the second step was queued.
             let start = Instant::now();
             while batch.steps() < before + 2 * N as u64 && start.elapsed() < Duration::from_millis(200) {
                 tokio::time::sleep(Duration::from_millis(1)).await;
@@ -158,8 +158,8 @@ async fn no_step_is_pipelined_that_needs_the_last_result() {
     assert!(batch.step_queue().is_none());
 }
 
-/// Returns the responses to these requests. They are sent one at a time, after the response to the previous one, or all
-/// at once.
+/// Returns the responses to these requests. The requests are sent all at once if `at_once`, otherwise each after the
+/// response to the previous request.
 async fn responses(server: &Server, open: Open, requests: &[Request], at_once: bool) -> Vec<SessionResponse> {
     let (mut session, _) = Session::open(server.unix(), open).await;
     let mut responses = Vec::new();

@@ -352,7 +352,8 @@ async fn the_transport_comes_before_physics() {
     let server = Server::start(&["--workers", "2"]);
     let niceness = |task: &Path| {
         let stat = std::fs::read_to_string(task.join("stat")).unwrap();
-        // The part after the name in parentheses: the field follows the state and fifteen numbers.
+        // Takes the text after the program's name in parentheses. The wanted field follows the state and fifteen
+        // numbers.
         let rest = stat.rsplit_once(") ").unwrap().1.to_owned();
         rest.split(' ').nth(16).unwrap().parse::<i32>().unwrap()
     };
@@ -583,7 +584,7 @@ async fn requests_are_counted_by_kind_and_told_at_the_end() {
 #[tokio::test]
 async fn a_session_that_ended_in_order_has_freed_its_places(#[case] envs: u32) {
     const OPENS: u64 = 1_000;
-    // One session fills the server, so each `open` needs all the room of the previous session.
+    // A single session fills the server, so each `open` needs all environments of the previous session.
     let server = Server::start(&["--max-envs", &envs.to_string(), "--max-sessions", "1"]);
     let mut connection = client(server.tcp()).await;
     for seed in 0..OPENS {

@@ -133,7 +133,7 @@ fn an_edit_equals_compiling_the_edited_text() {
     for make in ROBOTS {
         let mut walker = make();
         for corner @ [power, density, friction] in corners(&walker) {
-            // An earlier edit, to check that edits do not accumulate.
+            // Makes an earlier edit, to check that edits do not accumulate.
             walker.set_parameters(&[1.0, 1234.0, 0.3]);
             walker.set_parameters(&corner);
             let mut xml = walker.mjcf().replacen(r#"friction="0.8 "#, &format!(r#"friction="{friction} "#), 1);
@@ -150,9 +150,9 @@ fn an_edit_equals_compiling_the_edited_text() {
             for (a, b) in edited.iter().zip(&compiled) {
                 assert_eq!((a.name, a.values.len()), (b.name, b.values.len()));
                 for (x, y) in a.values.iter().zip(&b.values) {
-                    // The model scales masses, while the reference integrates them from a density. The rounding errors
-                    // differ, and derived arrays amplify them: 4e-13 is the documented bound. Numbers below 1e-6 are
-                    // rounding errors themselves.
+                    // The edit scales masses, while the reference model integrates them from a density. So rounding
+                    // errors differ, and derived arrays amplify them: 4e-13 is the documented bound. Numbers below 1e-6
+                    // are only rounding errors.
                     let error = (x - y).abs() / x.abs().max(y.abs()).max(1e-6);
                     assert!(error <= 4e-13, "{} at {corner:?}: {x} and {y}", a.name);
                 }
@@ -200,7 +200,7 @@ fn friction_decides_how_fast_a_sliding_robot_slows_down() {
         let mut walker = make();
         for friction in [0.2, 0.8, 1.4] {
             let felt = felt_friction(&mut walker, friction);
-            // Tolerance for MuJoCo's soft friction, which gives way a little.
+            // The tolerance is large, because MuJoCo's friction is soft and lets the robot slip a little.
             assert!((felt - friction).abs() < 0.1 * friction, "{} {friction}: {felt}", walker.spec().name);
         }
     }
@@ -354,8 +354,8 @@ fn robot_succeeds_that_was_20_m_ahead_in_any_step() {
     }
 }
 
-/// The reference implementation judges after the reset, so it never judges the step that ends an episode. This
-/// environment does.
+/// The reference implementation judges success after the reset, so it never judges the step that ends an episode. This
+/// environment also judges that step.
 #[test]
 fn robot_succeeds_that_falls_in_the_step_to_20_m() {
     for make in ROBOTS {
@@ -371,7 +371,7 @@ fn robot_succeeds_that_falls_in_the_step_to_20_m() {
     }
 }
 
-/// Runs 1000-step episodes whether or not the robot has fallen.
+/// Runs episodes of 1000 steps, which continue after the robot has fallen.
 fn endure(make: Make, corner: [f64; 3], actions: Actions, n_steps: usize) {
     let mut walker = make();
     walker.set_parameters(&corner);
@@ -457,9 +457,9 @@ fn a_reset_after_use_equals_a_fresh_one() {
             used.set_parameters(&parameters);
             assert_eq!(restart(&mut used), fresh);
         }
-        // The same without new parameters, as within a trial.
+        // The result is the same without new parameters, as within a trial.
         assert_eq!(restart(&mut used), fresh);
-        // The same after a divergence.
+        // The result is the same after a divergence.
         let n = used.spec().state.len();
         used.reset_to(&vec![1e20; n]);
         assert_eq!(restart(&mut used), fresh);
@@ -500,13 +500,13 @@ fn divergence_ends_the_episode_with_finite_numbers() {
             walker.load(&state).unwrap();
             assert_eq!(saved(walker), state);
         };
-        // Divergence during a step: a control above MuJoCo's limit of 1e10.
+        // The physics diverge during a step, because of a control above MuJoCo's limit of 1e10.
         walker.set_parameters(&[1e11, 1000.0, 0.8]);
         walker.reset(&mut stream(0));
         let before = observation(&walker);
         check(&mut walker, &before);
         check(&mut walker, &before);
-        // Divergence at the reset.
+        // The physics diverge at the reset.
         let n = walker.spec().state.len();
         walker.reset_to(&vec![1e20; n]);
         let zeros = vec![0.0; walker.spec().observation.len()];

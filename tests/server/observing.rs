@@ -8,7 +8,7 @@ use perturb::proto::{
 };
 use rstest::rstest;
 
-/// A number of steps longer than an episode of any environment.
+/// A number of steps that is larger than the step limit of every environment.
 const STEPS: u64 = 1010;
 
 fn observing(open: Open) -> Open {

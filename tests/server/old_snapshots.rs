@@ -1,5 +1,5 @@
-//! Snapshots of earlier servers can be restored, unless their environment has a new revision. Each was saved by the
-//! server of commit 886bf00, with seed 77 and index 0 in version R, after 20 steps.
+//! Snapshots of earlier servers can be restored, unless their environment has a new revision. Each snapshot was saved
+//! by the server of commit 886bf00, with seed 77 and index 0 in version R, after 20 steps.
 
 #[cfg(feature = "mujoco")]
 use crate::common::server::{Actor, environment};
@@ -11,7 +11,7 @@ use perturb::proto::{SessionResponse, session_response::Response};
 
 const SEED: u64 = 77;
 
-/// Removes from the first episode's end what the episode achieved, because an old snapshot of a robot does not contain
+/// Removes the achieved value from the end of the first episode, because an old snapshot of a robot does not contain
 /// the distance so far.
 #[cfg(feature = "mujoco")]
 fn forget(mut responses: Vec<SessionResponse>) -> Vec<SessionResponse> {

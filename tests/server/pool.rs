@@ -1,4 +1,5 @@
-//! The pool: a batch gives the bytes of its environments, no matter which thread steps them, and frees what it used.
+//! The pool: a batch gives the bytes of its environments, no matter which thread steps them, and frees its
+//! environments.
 
 use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
@@ -191,7 +192,7 @@ async fn next_step_mode_resets_with_reward_0_and_no_flags() {
     assert!(!beyond_the_limit(&next.observations) && next.ended.is_empty() && next.final_observations.is_empty());
     assert_eq!(next.started[0].1.id.episode_index, 1);
 
-    // The ignored action has no effect: another action gives the same.
+    // The ignored action has no effect, so another action gives the same result.
     drop(batch);
     let (mut other, _) = fall(pool_with_room(&pool).await, Autoreset::NextStep).await;
     assert_eq!(other.step(&[1, 0, 0, 0]).await.unwrap(), next);
@@ -237,7 +238,7 @@ async fn disabled_mode_refuses_steps_of_ended_environments() {
 async fn a_refused_step_names_the_slots_that_ended() {
     let spec = common::catalogue().find("CartPole").unwrap();
     let pool = Pool::new(4, 2000).unwrap();
-    // Large enough for several shards.
+    // The batch is large enough for several shards.
     let size = 2000;
     let (mut batch, _, _) = Batch::open(&pool, batch_settings(spec, size, Autoreset::Disabled)).await.unwrap();
     let fallen = |angle| move |slot| ResetEntry { state: Some(vec![0.0, 0.0, angle, 0.0]), ..entry(slot) };
@@ -283,7 +284,7 @@ struct Seen {
     start: Option<EpisodeStart>,
 }
 
-/// Splits a batch's result into those of its environments.
+/// Splits a batch's result into the results of its environments.
 fn cut(spec: &EnvironmentSpec, size: usize, stepped: &StepResult) -> Vec<Seen> {
     let row = |bytes: &Bytes, i: usize, n: usize| bytes[4 * n * i..][..4 * n].to_vec();
     let o = spec.observation.len();
@@ -304,7 +305,7 @@ fn cut(spec: &EnvironmentSpec, size: usize, stepped: &StepResult) -> Vec<Seen> {
 #[tokio::test]
 async fn bytes_do_not_depend_on_the_number_of_workers() {
     for spec in common::catalogue().specs() {
-        // Large enough for several shards, even for the cheapest environment.
+        // The batch is large enough for several shards, even with the cheapest environment.
         let size = (100.0 / spec.step_cost).ceil() as usize;
         let mut runs: Vec<Vec<StepResult>> = Vec::new();
         for workers in [1, 2, 4] {
@@ -372,7 +373,7 @@ async fn small_batches_finish_before_a_large_one_that_came_first() {
     const ATTEMPTS: usize = 50;
     let spec = common::catalogue().find("Acrobot").unwrap();
     let size = 40_000; // over 200 shards
-    // Still too expensive to be polled for, which would call the wakers before the end.
+    // The small batches are still too expensive for polling. With polling, the wakers would be called before the end.
     let small = 1000;
     let pool = Pool::new(1, size + 10 * small).unwrap();
     let mut batches = Vec::new();
@@ -411,7 +412,7 @@ async fn poll_once<F: Future>(mut future: Pin<&mut F>) -> Poll<F::Output> {
     poll_fn(|context| Poll::Ready(future.as_mut().poll(context))).await
 }
 
-/// Waits until a condition holds that the workers make true.
+/// Waits until the workers have made a condition true.
 async fn wait_until(condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(30);
     while !condition() {
@@ -472,7 +473,7 @@ async fn workers_that_fell_asleep_are_woken_for_every_job() {
         Batch::open(&pool, batch_settings(common::catalogue().find(name).unwrap(), size, Autoreset::SameStep))
     };
     let work = async {
-        // Too expensive to run on the session's thread.
+        // The small batches are too expensive to run on the session's thread.
         let (mut small, ..) = open("Acrobot", 50).await.unwrap();
         let (mut other, ..) = open("Acrobot", 50).await.unwrap();
         let (mut large, ..) = open("Acrobot", 900).await.unwrap(); // several shards
@@ -512,7 +513,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
     let size = 20_000;
     let pool = Pool::new(2, size).unwrap();
     let mut in_mid_step = 0;
-    // Not every attempt succeeds, because this thread may sleep for as long as the step takes.
+    // An attempt may fail, because this thread may sleep for as long as the step takes.
     for _ in 0..50 {
         let (mut batch, ..) = Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)).await.unwrap();
         let actions = vec![0; 4 * size];
@@ -524,7 +525,7 @@ async fn a_batch_dropped_in_mid_step_gives_its_environments_back() {
         }
     }
     assert!(in_mid_step > 0);
-    // Also if the batch is dropped while it is being opened.
+    // The environments are also freed if the batch is dropped while it is being opened.
     {
         let open = pin!(Batch::open(&pool, batch_settings(spec, size, Autoreset::SameStep)));
         let _ = poll_once(open).await;

@@ -16,7 +16,7 @@ const SINGLE_STEP: f64 = 1e-12;
 /// The tolerance of a trajectory: over 50 steps, errors of single steps grow less than a thousandfold.
 const TRAJECTORY: f64 = 1e-9;
 const TRAJECTORY_STEPS: usize = 50;
-/// The tolerance of rounding to f32: half an ulp on each side, relative, or absolute below 1.
+/// The tolerance of rounding to f32: half an ulp on each side. It is relative, or absolute for numbers below 1.
 const OBSERVATION: f64 = 1.2e-7;
 
 /// One recorded trajectory.
@@ -57,8 +57,8 @@ fn cases() -> Vec<Case> {
     GOLDEN.lines().enumerate().map(case).collect()
 }
 
-/// Replays recorded actions in an environment. Pendulum's recorded torques are f64, which the protocol's f32 cannot
-/// carry.
+/// Replays recorded actions in an environment. Pendulum's recorded torques are f64, so they cannot be actions, which
+/// are f32.
 enum Replay {
     Discrete(Box<dyn Environment>),
     Pendulum(Pendulum),

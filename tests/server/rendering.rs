@@ -160,7 +160,8 @@ async fn up_is_up_and_right_is_right() {
     assert!(left_x < 0.3 && right_x > 0.7, "{left_x} {right_x}");
     assert!(right_y > centre(&valley, SMALL, blue).1 + 0.2);
 
-    // Hanging, upright, and both links to the right. The angle is measured from hanging, anticlockwise.
+    // The two links hang down, stand upright, and point to the right. The angle is measured from hanging,
+    // anticlockwise.
     for (angle, x, y) in [(0.0, 0.0, -1.0), (PI, 0.0, 1.0), (FRAC_PI_2, 1.0, 0.0)] {
         let pixels = at(&server, "Acrobot", &[angle, 0.0, 0.0, 0.0], SMALL).await;
         let (tip_x, tip_y, _) = centre(&pixels, SMALL, orange);
@@ -204,7 +205,7 @@ async fn lengths_can_be_seen() {
         }
         assert!(counts[1] > 1.6 * counts[0], "{name}: {counts:?}");
     }
-    // Absurd lengths also work: a pole a hundred times as long is completely visible.
+    // Absurd lengths also work: a pole of a hundred times the length is completely visible.
     let open = Open { parameters: parameters(&[("length", &[(100.0, 100.0)])]), ..plain("CartPole", 1) };
     let (mut session, _) = Session::open(server.unix(), open).await;
     let (_, y, _) = centre(&session.render(0, SMALL).await, SMALL, |[r, g, b]| r > g && g > b && b < 200);
@@ -233,7 +234,7 @@ async fn the_camera_follows_a_robot_wherever_it_runs() {
             let again = at(&server, name, &robot_state(name, 0.0), SMALL).await;
             assert!(again == start, "{name}: the place of the last picture shows in this one");
         }
-        // A hundred steps forward with a run-up.
+        // The robot takes a hundred steps and moves forward.
         let (mut session, opened) =
             Session::open(server.unix(), Open { autoreset_mode: AutoresetMode::NextStep.into(), ..plain(name, 1) })
                 .await;
@@ -366,7 +367,7 @@ fn server_without_gl(switch: impl FnOnce(&mut Command, &std::path::Path)) -> Ser
 
 #[tokio::test]
 async fn without_opengl_the_server_runs_and_says_what_is_missing() {
-    // First without a driver, then with a library that cannot be loaded.
+    // OpenGL fails first without a driver, then with a library that cannot be loaded.
     let no_driver = server_without_gl(|command, _| {
         command.env("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json");
     });

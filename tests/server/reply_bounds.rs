@@ -1,4 +1,5 @@
-//! Clients learn the maximum length of replies before a reply is too long for their library.
+//! Tests of the maximum length of replies that the server announces, with which clients avoid replies that are too long
+//! for their gRPC library.
 
 use crate::common::server::{Actor, Server, Session, catalogue, client, open, parameters};
 use bytes::Bytes;

@@ -57,8 +57,8 @@ fn sealed(content: Vec<u8>) -> Vec<u8> {
     [content, sum.to_vec()].concat()
 }
 
-/// Returns an environment in its first trial's second episode, after at most 4 steps, because some environments end
-/// soon.
+/// Returns an environment in the second episode of its first trial. It has taken at most 4 steps, because episodes of
+/// some environments end soon.
 fn used(spec: &EnvironmentSpec) -> Episodes {
     let mut e = episodes(spec, Version::E, 31, 5, 3);
     step(&mut e, &action_bytes(spec, 1, 0));
@@ -117,7 +117,7 @@ fn a_snapshot_in_mid_episode_continues_with_the_same_bytes() {
         let steps = u64::from(spec.step_limit) + 100;
         let expected = play(&mut e, 3, 0, steps);
         assert!(expected.iter().any(|line| line.starts_with("start")), "{}: later episodes are compared", spec.name);
-        // Restores into the same environment, into one with another history, and into a new one.
+        // Restores into the same environment, into an environment with another history, and into a new environment.
         for mut target in [e, other(spec), episodes(spec, Version::D, 0, 0, 1)] {
             target.restore(&snapshot).unwrap();
             assert_eq!(target.snapshot(), snapshot, "{}", spec.name);
@@ -238,7 +238,7 @@ fn a_snapshot_continues_in_another_process() {
     }
 }
 
-// What is refused.
+// Refused snapshots.
 
 #[test]
 fn the_layout_here_is_that_of_snapshots() {
@@ -296,7 +296,8 @@ fn contradictory_snapshots_are_refused() {
         ("a goal reached in the future", |s, _| s.progress.reached_at = s.progress.length + 1),
         ("more trials than episodes", |s, _| s.progress.trial = s.progress.episode + 1),
         ("counts at their end", |s, _| (s.progress.trial, s.progress.episode) = (u64::MAX, u64::MAX)),
-        // One number fewer is the old format, before robots stored their largest distance.
+        // A state with one number fewer is valid: it is the old format, in which robots did not store their largest
+        // distance.
         ("two numbers too few in the state", |s, _| s.state.truncate(s.state.len() - 2)),
         ("a number too many in the state", |s, _| s.state.push(0.0)),
         ("a state that is no number", |s, _| s.state[0] = f64::NAN),
@@ -356,7 +357,8 @@ fn a_snapshot_with_something_behind_it_is_refused() {
     }
 }
 
-/// Restores bytes that may be no valid snapshot. They are either refused without a change, or accepted without harm.
+/// Restores bytes that may be no valid snapshot. Asserts that they are either refused without a change, or accepted
+/// without harm.
 fn try_restore(spec: &EnvironmentSpec, bytes: &[u8]) -> Result<(), TestCaseError> {
     let mut e = other(spec);
     let before = e.snapshot();
@@ -401,7 +403,7 @@ proptest! {
     }
 }
 
-// In batches.
+// Snapshots of batches.
 
 fn batch_settings(spec: &'static EnvironmentSpec, seed: u64, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, seed, 0, 2);
@@ -434,7 +436,7 @@ async fn run(batch: &mut Batch, steps: std::ops::Range<u64>) -> Vec<StepResult> 
 async fn a_batch_restored_into_another_goes_on_with_the_same_bytes() {
     for spec in common::catalogue().specs() {
         for mode in [Autoreset::NextStep, Autoreset::SameStep] {
-            // Large enough for several shards, cut differently for one and for four workers.
+            // The batch is large enough for several shards, and is cut differently for one worker and for four workers.
             let size = (if spec.step_cost < 1.0 { 60.0 } else { 200.0 } / spec.step_cost).ceil() as usize;
             let (one, four) = (Pool::new(1, size).unwrap(), Pool::new(4, size).unwrap());
             let (mut batch, ..) = Batch::open(&one, batch_settings(spec, 1, size, mode)).await.unwrap();
@@ -492,7 +494,7 @@ async fn a_refused_restore_of_several_changes_nothing_in_any_shard() {
         run(&mut batch, 0..9).await;
         let before = batch.snapshot(all()).await.unwrap();
         assert!(before.iter().zip(&early).all(|(a, b)| a != b));
-        // One invalid snapshot, at the start, in the middle or at the end. The others are valid.
+        // The snapshot at the start, in the middle or at the end is invalid. All other snapshots are valid.
         for wrong in [0, size / 2, size - 1] {
             let mut entries: Vec<(usize, Bytes)> = early.iter().cloned().enumerate().collect();
             entries[wrong].1 = Bytes::from_static(b"garbage");
@@ -531,7 +533,7 @@ async fn after_a_refused_restore_observations_are_those_of_before() {
         let early = batch.snapshot(vec![0]).await.unwrap().remove(0);
         let last = run(&mut batch, 0..4).await.pop().unwrap();
         batch.restore(vec![(0, early), (1, Bytes::new())]).await.unwrap_err();
-        // A step reports all observations. A reset of another slot shows that the first slot kept its own.
+        // A step reports all observations. A reset of another slot shows that the first slot kept its observation.
         batch.reset(vec![ResetEntry { slot: 2, seed: None, distributions: None, state: None }]).await.unwrap();
         let now = batch.snapshot(vec![0]).await.unwrap().remove(0);
         let observed = batch.restore(vec![(0, now)]).await.unwrap();

@@ -1,4 +1,4 @@
-//! Robots share one simulation for each thread, which must not be visible.
+//! Robots share one simulation for each thread. The sharing must not change any result.
 
 use perturb::{
     env::{Action, ActionSpace, Environment, Purpose, Stream},
@@ -90,7 +90,7 @@ fn robots_that_take_turns_live_as_each_does_alone(
     const LIVES: u64 = 7;
     const TURNS: usize = 400;
     let alone = |number| {
-        // Runs on a thread of its own, and so with a simulation of its own.
+        // The robot lives on a separate thread, and so with a separate simulation.
         let live = move || {
             let mut life = Life::new(make, number);
             (0..TURNS).for_each(|_| life.go_on());
@@ -102,7 +102,7 @@ fn robots_that_take_turns_live_as_each_does_alone(
     let mut order = Stream::new(2, 0, Purpose::InitialState, threads as u64);
     let mut turns = [0; LIVES as usize];
     while turns.iter().any(|&turns| turns < TURNS) {
-        // Each thread gets some of the robots that continue now, and a robot changes between threads.
+        // Some robots continue now, and each thread gets some of them. A robot moves between threads.
         let mut hands: Vec<Vec<&mut Life>> = (0..threads).map(|_| Vec::new()).collect();
         for (life, turns) in lives.iter_mut().zip(&mut turns) {
             if *turns < TURNS && order.unit() < 0.6 {

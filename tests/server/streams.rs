@@ -71,7 +71,8 @@ fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
                     .collect();
                 let requested = e.receipt().requested;
                 for (requested, expected) in requested.iter().zip(&expected) {
-                    // `at` multiplies and adds in the same order, except that the version's length was rounded.
+                    // `at` multiplies and adds in the same order. Only the length of the version's interval was rounded
+                    // before.
                     assert!((requested - expected).abs() <= 1e-15 * expected.abs(), "{}", spec.name);
                 }
                 e.begin(None);

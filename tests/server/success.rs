@@ -204,7 +204,7 @@ fn counts_start_anew_with_every_episode() {
     }
 }
 
-// The real environments, driven to both sides of their rules.
+// The real environments, with episodes on both sides of their success rules.
 
 /// Plays an environment with discrete actions from this state to the end of the episode. `policy` chooses actions from
 /// time and observation.
@@ -311,8 +311,8 @@ fn acrobot_succeeds_up_to_80_steps() {
     assert!(seen, "both sides were seen: {lengths:?}");
 }
 
-/// Plays an episode of a pendulum that is held at an angle in each step. Returns it, and whether the pendulum was near
-/// upright after each step.
+/// Plays an episode of a pendulum that is held at an angle in each step. Returns whether the pendulum was near upright
+/// after each step, and the ended episode.
 fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, EpisodeEnd) {
     let spec = tasks::catalogue().find("Pendulum").unwrap();
     // The rod is light enough for the torque to hold it at any angle.
@@ -359,7 +359,7 @@ fn pendulum_succeeds_after_100_steps_near_upright() {
     assert!(entries.contains(&99) && entries.contains(&100), "both sides were seen: {entries:?}");
 }
 
-// The predicates themselves, on both sides of their thresholds.
+// The conditions of goals and ends of episodes, on both sides of their thresholds.
 
 /// Takes a step from random states between `low` and `high`, and compares the new state's (terminated, goal) with
 /// `expected`. Some new states lie within 1e-3 of the threshold on either side. `margin` is positive where the goal
@@ -434,7 +434,7 @@ fn acrobot_ends_when_its_tip_is_a_link_above_the_joint() {
 
 #[test]
 fn pendulum_is_near_upright_within_a_third_of_pi_and_never_ends() {
-    // Uses the cosine, so that the angle need not be wrapped.
+    // `near` uses the cosine, so that the angle need not be wrapped.
     let near = |s: &[f64]| s[0].cos() - 0.5;
     check_goal("Pendulum", &[-20.0, -8.0], &[20.0, 8.0], |s| (false, near(s) > 0.0), near);
 }

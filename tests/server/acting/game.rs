@@ -15,7 +15,7 @@ use perturb_policy::{
 /// The seed of the policy's random streams.
 pub const SEED: u64 = 77;
 
-/// An environment and a policy, with everything that can be varied about the policy.
+/// An environment and a policy, with all settings of the policy that tests vary.
 #[derive(Clone, Copy)]
 pub struct Game {
     pub environment: &'static str,
@@ -81,7 +81,7 @@ impl Game {
         }
     }
 
-    /// Returns weights that are a function of their index and `version` only.
+    /// Returns the weights of a policy. Each weight is a function of its index and of `version` only.
     pub fn weights(self, environment: &Environment, version: u64) -> Vec<f32> {
         let weight = |i| (mixed(mixed(i) ^ version) >> 40) as f32 / (1 << 24) as f32 * 1.6 - 0.8;
         (0..self.spec(environment).n_weights() as u64).map(weight).collect()

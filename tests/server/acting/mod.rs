@@ -13,7 +13,7 @@ use perturb::proto::{
 use perturb_policy::CollectUntil;
 use rstest::rstest;
 
-/// A number of steps longer than an episode of any environment here.
+/// A number of steps that is larger than the step limit of every environment that these tests play.
 const STEPS: u32 = 520;
 
 /// Compares two replies array by array, so a failure names the array.
@@ -68,7 +68,8 @@ async fn same_bytes(game: Game) {
     let server = Server::with_folders(&["--workers", "2"]);
     let mut client = Client::begin(game, &server).await;
     let (mut session, environment) = game.session(&server).await;
-    // Tasks: some steps; more steps than an episode has, with new weights; complete episodes; steps after them.
+    // The policy plays four tasks, each with new weights: some steps, more steps than an episode has, complete
+    // episodes, and some more steps.
     let asked = [Asked::Steps(7), Asked::Steps(STEPS), Asked::Episodes(8), Asked::Steps(5)];
     let mut ends = 0;
     for (version, task) in (0..).zip(asked) {

@@ -28,7 +28,7 @@ async fn transport_does_not_free_thousands_of_hoppers() {
     .await;
     let took = transport_time(&server) - before;
     println!("the transport took {took:?} of a processor");
-    // When the transport thread freed the environments itself, the Hoppers alone took 155 ms. What is left is the time
-    // for connections and for opening the CartPoles.
+    // An earlier server freed environments on the transport thread, which took 155 ms for the Hoppers alone. Now the
+    // thread needs time only for connections and for opening the CartPoles.
     assert!(took < Duration::from_millis(100), "{took:?}");
 }

@@ -1,4 +1,4 @@
-//! How much memory clients can occupy, and for how long.
+//! Limits of the memory that clients can occupy, and of the time for which they can occupy it.
 
 use super::{
     Neighbour,
@@ -13,7 +13,7 @@ use prost::Message;
 use std::time::{Duration, Instant};
 use tonic::Code;
 
-/// Memory that the budget does not count, bytes: that of the allocator and of HTTP/2, and some tolerance.
+/// The memory that the budget does not count, bytes: the memory of the allocator and of HTTP/2, and some tolerance.
 const REST: usize = 150 << 20;
 
 fn message(request: impl Into<Request>) -> Vec<u8> {
@@ -33,7 +33,7 @@ async fn unfinished_messages_take_no_more_than_the_budget() {
     let half = Bytes::from(vec![0; LENGTH - 1]);
     let mut connections = Vec::new();
     let mut calls = Vec::new();
-    // In total 600 MB.
+    // The requests have 600 MB in total.
     for _ in 0..20 {
         let mut connection = Connection::new(server.port(), 1 << 20).await;
         let mut call = connection.call(SESSION).await.unwrap();
@@ -71,7 +71,7 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
     let neighbour = Neighbour::start(server.unix());
     let before = server.memory();
     let (mut connections, mut calls) = (Vec::new(), Vec::new());
-    // In total 1.2 GB.
+    // The pictures have 1.2 GB in total.
     for _ in 0..100 {
         let mut connection = Connection::new(server.port(), 1 << 16).await;
         let mut call = connection.call(SESSION).await.unwrap();
@@ -93,7 +93,7 @@ async fn pictures_that_nobody_reads_take_no_more_than_the_budget() {
             _ => assert!(start.elapsed() < Duration::from_secs(60), "it is never refused"),
         }
     }
-    // Leaves time to draw the pictures that are still queued.
+    // Waits until the queued pictures have been drawn.
     tokio::time::sleep(Duration::from_secs(2)).await;
     let grown = server.peak_memory() - before;
     println!("the server took {} MB more", grown >> 20);
@@ -154,7 +154,7 @@ async fn a_snapshot_of_empty_lists_takes_no_memory() {
     let (mut session, _) = Session::open(server.tcp(), same_step("CartPole", 1)).await;
     let good = session.snapshot(&[]).await.remove(0);
     let before = server.memory();
-    // As many parameters as fit into the bytes, each with an empty list of intervals.
+    // Sends as many parameters as fit into the bytes, each with an empty list of intervals.
     let name = good.windows(8).position(|window| window == b"CartPole").unwrap();
     for at in name + 8..good.len().min(name + 100) {
         let mut bad = good[..at].to_vec();
@@ -186,7 +186,7 @@ async fn client_that_neither_reads_nor_ends_a_message_is_gone() {
     let (code, message) = half.status().await.unwrap();
     assert_eq!(code, Code::DeadlineExceeded as i32, "{message}");
     until("the connection is closed", async || unread.is_closed()).await;
-    // Both environments are free again. A session that is idle and has read all its replies is kept.
+    // Both environments are free again. A session that is idle, but has read all its replies, continues.
     let mut session = Session::connect(server.tcp()).await;
     until("there is room", async || matches!(session.answer(open("MountainCar", 2, 1)).await, Response::Opened(_)))
         .await;

@@ -71,7 +71,8 @@ async fn counts_are_bounded_while_a_large_request_is_decoded() {
     let neighbour = Neighbour::start(server.unix());
     let before = server.memory();
     let many = 15 << 20;
-    // Too many snapshots, seeds, distributions, or widths of a policy; and too many entries within an `open`.
+    // Each request has too many entries in one field: snapshots, seeds, distributions, widths of a policy, or a field
+    // of an `open`.
     for request in [
         request(5, &empty_entries(2, many)),
         request(3, &[0x10, 1].repeat(many)),

@@ -20,7 +20,7 @@ async fn a_small_picture_does_not_wait_for_all_the_large_ones() {
     for session in &sessions {
         session.send(Render { slot: 0, width: 2048, height: 2048 }).await;
     }
-    // Requested before this thread is busy with reading the large pictures.
+    // The small picture is requested before this thread is busy with reading the large pictures.
     small.send(Render { slot: 0, width: 64, height: 64 }).await;
     let mut reading = tokio::task::JoinSet::new();
     for mut session in sessions {

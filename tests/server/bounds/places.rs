@@ -1,4 +1,5 @@
-//! Limits of the number of sessions and connections, and timeouts of clients that occupy one without using it.
+//! Limits of the number of sessions and connections, and timeouts of clients that occupy a session or connection
+//! without using it.
 
 use super::client::{Connection, SESSION};
 use crate::common::server::{Server, Session, client, command, open, until, within};
@@ -18,7 +19,7 @@ async fn half_a_preface_is_closed_in_time() {
         half.write_all(part).unwrap();
         half.set_read_timeout(Some(Duration::from_secs(60))).unwrap();
         let closed = tokio::task::spawn_blocking(move || half.read_to_end(&mut Vec::new())).await.unwrap();
-        // The connection was closed or reset; the read did not time out.
+        // Checks that the connection was closed or reset, and that the read did not time out.
         let waited = closed.as_ref().is_err_and(|error| error.kind() == std::io::ErrorKind::WouldBlock);
         assert!(!waited, "{closed:?}");
     }

@@ -26,7 +26,7 @@ const MAX_CONCURRENT_STREAMS: u16 = 3;
 const REFUSED_STREAM: u32 = 7;
 const CANCEL: u32 = 8;
 
-/// A client that ignores the limit. No gRPC library does so: they all wait until a stream ends.
+/// A client that ignores the limit of concurrent streams. gRPC libraries keep the limit: they wait until a stream ends.
 struct Greedy {
     tcp: TcpStream,
     next: u32,
@@ -62,7 +62,7 @@ impl Greedy {
         Frame { kind: head[3], stream: number(&head[5..]), payload }
     }
 
-    /// Reads the server's first frame, its settings. Returns its maximum number of streams.
+    /// Reads the server's first frame, its settings. Returns the maximum number of streams in these settings.
     async fn announced(&mut self) -> Option<u32> {
         let frame = self.receive().await;
         assert_eq!(frame.kind, SETTINGS);
@@ -84,7 +84,7 @@ impl Greedy {
             ("content-type", "application/grpc"),
             ("te", "trailers"),
         ] {
-            // Name and value are written uncompressed, each after its length.
+            // The name and the value of the header are written uncompressed, each after its length.
             head.push(0);
             for text in [name, value] {
                 head.push(text.len() as u8);

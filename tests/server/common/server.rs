@@ -26,13 +26,13 @@ pub const DEADLINE: Duration = Duration::from_secs(120);
 /// The number of steps that [`Session::play`] sends before it reads a reply.
 const AHEAD: u64 = 32;
 
-/// A running server. It is killed when this is dropped.
+/// A running server. The server is killed when this value is dropped.
 pub struct Server {
     pub child: Child,
     /// The addresses at which it listens, in the order in which it printed them.
     pub addresses: Vec<String>,
     pub directory: TempDir,
-    /// The server's standard input, which closes when this is dropped.
+    /// The server's standard input, which closes when this value is dropped.
     pub stdin: Option<ChildStdin>,
 }
 
@@ -409,7 +409,7 @@ pub fn refusal((code, message): (Code, String)) -> String {
     format!("{code:?}: {}\n", message.replace(", HalfCheetah, Hopper", ""))
 }
 
-/// Returns the result of a step in a response. Panics if the response is another.
+/// Returns the result of a step in a response. Panics if the response is of another kind.
 pub fn stepped(response: &SessionResponse) -> &Stepped {
     match &response.response {
         Some(Response::Stepped(stepped)) => stepped,

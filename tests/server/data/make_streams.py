@@ -1,4 +1,6 @@
-"""Writes streams.jsonl: what NumPy draws from the streams of src/env/seeding.rs. Run: python3 make_streams.py
+"""Writes streams.jsonl: the numbers that NumPy draws from the streams of src/env/seeding.rs.
+
+Run: python3 make_streams.py
 
 Numbers are hexadecimal: `words` are the raw 64 bits, `units` the bits of the doubles in [0, 1).
 """

@@ -29,8 +29,8 @@ fn changing(spec: &'static EnvironmentSpec, when: &[(&'static str, f64)]) -> Epi
     disturbed(spec, Version::D, &[when, &changed(spec)].concat(), ADDRESS)
 }
 
-/// Plays the same episode without the disturbance: whenever `is_changed` changes, its environment gets the other
-/// parameters and its own state again.
+/// Plays the same episode in an environment without the disturbance. When `is_changed` changes, the environment gets
+/// the other parameters, and then its state again.
 struct ByHand {
     environment: Box<dyn Environment>,
     sets: [Vec<f64>; 2],

@@ -85,7 +85,7 @@ fn disturbances_leave_the_other_draws_alone() {
                 let own = disturbance::disturbances(spec).len();
                 let tail = |values: &[f64]| values[values.len() - own..].to_vec();
                 for (requested, applied) in tail(&receipt.requested).into_iter().zip(tail(&receipt.applied)) {
-                    // After a change, masses are read back from the physics, exactly except for rounding.
+                    // Masses after a change are read back from the physics. They are exact up to rounding.
                     assert!((requested - applied).abs() <= 1e-9 * requested, "{}: {requested} {applied}", spec.name);
                 }
                 plain.begin(None);
@@ -221,7 +221,7 @@ fn names_that_are_neither_are_refused_with_those_that_are() {
 #[test]
 fn disturbed_episodes_follow_from_their_addresses() {
     for spec in common::catalogue().specs() {
-        // The third episode, once after two others and once directly.
+        // Begins the third episode of an environment, once after two other episodes and once directly.
         let mut after_others: Episodes = disturbed(spec, Version::D, &all(spec), (8, 2));
         play(&mut after_others, 1, 0, 3);
         after_others.begin(None);

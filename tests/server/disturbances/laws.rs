@@ -7,7 +7,7 @@ use perturb::env::{Action, Draw, Episodes, Purpose, Stream, Version};
 /// The number of draws for the test of a distribution.
 const DRAWS: u32 = 100_000;
 /// The bound of √n times the largest difference of two distribution functions. 999 of 1000 samples are below it
-/// (Kolmogorov). The samples here are always the same.
+/// (Kolmogorov). The samples in these tests are always the same.
 const MAX_KOLMOGOROV: f64 = 1.95;
 /// The number of standard deviations within which a count of successes lies in more than 9999 of 10 000 samples.
 const MAX_DEVIATIONS: f64 = 4.0;
@@ -90,13 +90,13 @@ fn normal_numbers_are_those_of_numpy() {
     let mut stream = Stream::at_step(&draw, Purpose::SensorNoise, 7);
     let numbers: Vec<f64> = (0..1_000_000).map(|_| stream.normal()).collect();
     let (first, last, sum) = NUMPY;
-    // Each number may differ by a relative 1e-13 from rounding. A single different decision would shift all later
-    // numbers.
+    // Each number may differ by a relative 1e-13 from rounding. If NumPy rejected a draw that
+    // this code accepts, all later numbers would differ.
     let is_near = |a: f64, b: f64| (a - b).abs() < 1e-11;
     assert!(numbers.iter().zip(first).all(|(&a, b)| is_near(a, b)), "{:?}", &numbers[..4]);
     assert!(is_near(numbers[numbers.len() - 1], last), "{}", numbers[numbers.len() - 1]);
     assert!((numbers.iter().sum::<f64>() - sum).abs() < 1e-6);
-    // Beyond 3.65, in the tail, another method is used.
+    // Numbers in the tail, beyond 3.65, are drawn by another method. Some of them occur.
     assert!((200..400).contains(&numbers.iter().filter(|number| number.abs() > 3.65).count()));
     assert_normal(numbers, 0.0, 1.0);
 }

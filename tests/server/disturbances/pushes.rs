@@ -60,7 +60,7 @@ fn a_push_gives_the_cart_its_momentum() {
 fn a_push_gives_the_car_and_the_pendulum_their_momenta() {
     let [_, v] = difference("MountainCar", &[-0.5, 0.0], 0.01)[..] else { unreachable!() };
     assert!((v - 0.01).abs() < ROUNDING, "{v}");
-    // The moment of inertia is that of a rod of 1 kg and 1 m about its end.
+    // The moment of inertia is 1/3 kg m²: a rod of 1 kg and 1 m that turns about its end.
     let [_, omega] = difference("Pendulum", &[0.3, 0.2], 0.4)[..] else { unreachable!() };
     assert!((omega / 3.0 - 0.4).abs() < ROUNDING, "{omega}");
 }
@@ -104,7 +104,7 @@ fn a_push_gives_the_hopper_its_momentum() {
     let expected: Vec<_> = (0..4).map(|_| step(&mut alone, None)).collect();
     step(&mut pushed, Some(IMPULSE));
     let (before, mass) = centre_of_mass(&pushed);
-    // The simulation of this thread then steps another hopper, which must not feel the force.
+    // This thread's simulation then steps another hopper, on which the force must not act.
     assert_eq!((0..4).map(|_| step(&mut after, None)).collect::<Vec<_>>(), expected);
     step(&mut pushed, None);
     let momentum = mass * ((centre_of_mass(&pushed).0 - before) / hopper::SPEC.control_timestep - 1.0);

@@ -1,4 +1,4 @@
-"""What a user of the package dm-env-rpc sees, against a running server: adaptor.py HOST:PORT DOCUMENT.
+"""Tests a running server with the adaptor of the package dm-env-rpc: adaptor.py HOST:PORT DOCUMENT.
 
 The document is docs/dm_env_rpc.md, whose examples must run. Exits with 1 unless every case passes.
 """
@@ -18,14 +18,14 @@ ADDRESS, DOCUMENT = sys.argv[1:]
 
 
 class Adaptor(unittest.TestCase):
-    """Cases with a world of their own."""
+    """Tests the adaptor; each case makes its own world."""
 
     def setUp(self):
         self.connection = connection.create_secure_channel_and_connect(ADDRESS, timeout=60)
         self.addCleanup(self.connection.close)
 
     def world(self, env_id, **settings):
-        """A new world, joined."""
+        """Makes a world and joins it. Returns the environment of the adaptor."""
         settings = {"env_id": env_id, **settings}
         return dm_env_adaptor.create_and_join_world(self.connection, settings, {}, extensions=self.extensions())[0]
 
@@ -33,7 +33,7 @@ class Adaptor(unittest.TestCase):
         return {"properties": properties.PropertiesExtension(self.connection)}
 
     def play(self, env, action):
-        """An episode with always the same action, without its first step."""
+        """Plays an episode with the same action in each step. Returns its time steps, without the first."""
         self.assertTrue(env.reset().first())
         steps = []
         while not steps or not steps[-1].last():

@@ -59,7 +59,7 @@ impl Agent {
     }
 
     pub async fn send(&self, payload: Option<Request>) {
-        // Ignored: if the stream has ended, receiving returns the reason.
+        // An error is ignored: if the stream has ended, receiving returns the reason.
         let _ = within(self.requests.as_ref().unwrap().send(EnvironmentRequest { payload })).await;
     }
 

@@ -1,8 +1,8 @@
-"""The compliance cases of the package dm-env-rpc, unchanged, against a running server.
+"""Runs the compliance cases of the package dm-env-rpc, unchanged, against a running server.
 
     compliance.py HOST:PORT ENVIRONMENT...
 
-This file only tells them how to reach a world. Exits with 1 unless every case of every environment passes.
+This file only defines how the cases reach a world. Exits with 1 unless every case of every environment passes.
 """
 
 import sys
@@ -18,13 +18,13 @@ CASES = 44
 
 
 def cases(address: str, environment: str) -> list[type[unittest.TestCase]]:
-    """The package's six classes of cases, for one environment."""
+    """Returns the package's six classes of cases, for one environment."""
     required = {"env_id": tensor_utils.pack_tensor(environment)}
-    # The package's own default: local credentials. One channel for all, since a new one takes 0.2 s.
+    # Local credentials are the package's default. All cases share a channel, since making a channel takes 0.2 s.
     channel = grpc.secure_channel(address, grpc.local_channel_credentials())
 
     class World:
-        """A stream and a world for each case."""
+        """Gives each case a stream and a world."""
 
         def setUp(self):
             self._connection = connection.Connection(channel)
@@ -93,13 +93,13 @@ def cases(address: str, environment: str) -> list[type[unittest.TestCase]]:
 
 
 def _least(spec: rpc.TensorSpec) -> rpc.Tensor:
-    """The least value of an action; one element stands for all."""
+    """Returns the minimum of an action. The single element stands for all elements."""
     payload = spec.min.WhichOneof("payload")
     return rpc.Tensor(shape=spec.shape, **{payload: {"array": getattr(spec.min, payload).array[:1]}})
 
 
 def main(address: str, *environments: str) -> int:
-    """Runs them; prints a line for each environment."""
+    """Runs the cases, and prints a line for each environment. Returns the exit status."""
     passed = True
     for environment in environments:
         load = unittest.defaultTestLoader.loadTestsFromTestCase

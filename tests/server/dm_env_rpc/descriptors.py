@@ -1,6 +1,7 @@
-"""Compares our definitions with the package's: descriptors.py FILE, a FileDescriptorSet that holds ours.
+"""Compares our protobuf definitions with those of the package dm-env-rpc: descriptors.py FILE.
 
-What is on the wire must be equal: packages, names, numbers, types, oneofs, reserved numbers. Exits with 1 if it is not.
+FILE is a FileDescriptorSet with our definitions. Everything that affects the wire format must be equal: packages,
+names, numbers, types, oneofs, reserved numbers. Exits with 1 if something differs.
 """
 
 import sys
@@ -13,7 +14,7 @@ from google.rpc import status_pb2
 
 
 def main(path: str) -> int:
-    """Prints how many files are equal, or what differs."""
+    """Prints how many files are equal, or the first file that differs. Returns the exit status."""
     ours = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(Path(path).read_bytes()).file}
     for module in (dm_env_rpc_pb2, properties_pb2, status_pb2):
         theirs = descriptor_pb2.FileDescriptorProto()
@@ -27,7 +28,7 @@ def main(path: str) -> int:
 
 
 def _wire(file: descriptor_pb2.FileDescriptorProto) -> descriptor_pb2.FileDescriptorProto:
-    """Without what is not on the wire: comments, options of languages, names for JSON, the order of declarations."""
+    """Removes everything that does not affect the wire format: comments, options, names for JSON, order."""
     file.ClearField("source_code_info")
     file.ClearField("options")
     for declarations in (file.message_type, file.enum_type):
@@ -42,7 +43,7 @@ def _wire(file: descriptor_pb2.FileDescriptorProto) -> descriptor_pb2.FileDescri
 
 def _strip(message: descriptor_pb2.DescriptorProto) -> None:
     message.nested_type.sort(key=lambda nested: nested.name)
-    # Adjacent ranges may be written as one.
+    # Adjacent ranges of reserved numbers may be written as a single range, so they are split into single numbers.
     reserved = sorted({number for r in message.reserved_range for number in range(r.start, r.end)})
     message.ClearField("reserved_range")
     for number in reserved:

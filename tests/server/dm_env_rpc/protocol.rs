@@ -23,8 +23,8 @@ use tonic::Code;
 /// The environment variable with a Python that has the packages of tests/server/dm_env_rpc/requirements.txt.
 const PYTHON: &str = "PERTURB_TEST_DM_ENV_RPC_PYTHON";
 
-/// Runs a program of tests/server/dm_env_rpc with that Python. Returns its output, or `None` if there is no such
-/// Python.
+/// Runs a program of tests/server/dm_env_rpc with the Python of [`PYTHON`]. Returns its output, or `None` if this
+/// variable is not set.
 fn python(program: &str, arguments: &[&str]) -> Option<String> {
     let Ok(python) = std::env::var(PYTHON) else {
         eprintln!(
@@ -250,7 +250,7 @@ async fn an_unknown_observation_is_refused_before_anything_is_done() {
     let unknown = Request::Step(rpc::StepRequest { actions, requested_observations: vec![1, 6, 2] });
     let mut refusals = String::new();
     for t in 0..3 {
-        // Checked before the first episode, during it, and before the second.
+        // The refusal is checked before the first episode, during the first episode, and before the second episode.
         if t == 2 {
             agent.reset(client::Settings::new()).await;
             twin.reset(client::Settings::new()).await;

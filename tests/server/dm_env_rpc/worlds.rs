@@ -145,7 +145,7 @@ async fn a_dropped_stream_frees_its_worlds_and_one_that_closes_too() {
 async fn world_continues_after_its_agent_vanishes_mid_step() {
     let server = Server::start(&["--workers", "1"]);
     let catalogue = server::catalogue(server.tcp()).await;
-    // The available environment with the most expensive step.
+    // Takes the environment with the most expensive step among those that this build has.
     let (name, action) = match catalogue.iter().any(|e| e.name == "HalfCheetah") {
         true => ("HalfCheetah", vector(&[0.5; 6])),
         false => ("Acrobot", choice(2)),
@@ -193,7 +193,7 @@ async fn reset_begins_the_next_episode_and_skips_none() {
     let episode_1 = play(&mut agent, 1, 5).await;
     assert_ne!(episode_0, episode_1);
     assert_eq!(agent.read("episode_index").await, uint64(1));
-    // A new seed applies to the next episode. After that, the counts continue.
+    // A new seed applies to the next episode. After this episode, the counts continue.
     agent.reset(Settings::from([("seed".into(), int64(4))])).await;
     agent.reset(none()).await;
     assert_eq!(play(&mut agent, 1, 5).await, episode_0);

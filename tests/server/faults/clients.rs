@@ -44,11 +44,11 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
             Box::new(UnixStream::connect(server.socket()).unwrap()),
         ];
         for connection in &mut connections {
-            // Ignored: the server may close the connection before it has read everything.
+            // Errors are ignored, because the server may close the connection before it has read everything.
             let _ = connection.write_all(piece);
             let _ = connection.flush();
         }
-        // Some clients disconnect, some stay.
+        // Some clients disconnect, and some stay connected.
         drop(connections.swap_remove(0));
         open_connections.push(Box::new(connections.remove(0)));
         tcp.goes_on().await;
@@ -61,7 +61,7 @@ async fn garbage_bytes_on_the_port_harm_nobody() {
 trait ReadWrite: Read + Write {}
 impl<T: Read + Write> ReadWrite for T {}
 
-/// The client that other tests start as a process, to kill it. It is not a test of its own.
+/// A client that other tests start as a process in order to kill it. This function is not a test.
 #[test]
 #[ignore = "a process for other tests"]
 fn client_that_steps_for_ever() {
@@ -79,7 +79,7 @@ fn client_that_steps_for_ever() {
     });
 }
 
-/// The client as a process, which is killed when this is dropped.
+/// The client as a process, which is killed when this value is dropped.
 struct ClientProcess(Child);
 
 impl ClientProcess {
@@ -148,7 +148,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
     const EACH: u32 = 5;
     let server = Server::start(&["--max-envs", "1003", "--max-sessions", "250"]);
     let bystander = Bystander::start(server.tcp()).await;
-    // Concurrent sessions, over one connection and over many, dropped during a step.
+    // Drops concurrent sessions during a step, once with one connection for all and once with a connection for each.
     let mut client = server::client(server.unix()).await;
     for own_connection in [false, true] {
         let mut sessions = Vec::new();
@@ -157,7 +157,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
                 true => Session::connect(server.tcp()).await,
                 false => Session::start(&mut client).await.unwrap(),
             };
-            // At first, the session that waited for room may still hold it.
+            // At first, the session of `room_for` may still hold the environments.
             until("there is room", async || {
                 matches!(session.answer(open("CartPole", EACH, seed)).await, Response::Opened(_))
             })
@@ -170,7 +170,7 @@ async fn two_hundred_sessions_opened_and_dropped_leave_nothing_behind() {
         drop((sessions, one_more));
         room_for(server.tcp(), 200 * EACH).await;
     }
-    // Successive sessions, dropped without waiting for a reply.
+    // Opens sessions one after the other, and drops each without waiting for a reply.
     for seed in 0..200 {
         let session = Session::connect(server.tcp()).await;
         session.send(open("CartPole", 1000, seed)).await;
@@ -206,7 +206,7 @@ async fn client_that_never_reads_costs_bounded_memory() {
     let sending = tokio::spawn({
         let (sent, stop, environment) = (Arc::clone(&sent), Arc::clone(&stop), environment.clone());
         async move {
-            // In total up to 800 MB of requests and 5 GB of replies.
+            // The client sends up to 800 MB of requests in total, with 5 GB of replies.
             for t in 0..100_000 {
                 let request = Some(step(Actor::new(&environment, N).actions(t)));
                 if stop.load(Ordering::Relaxed) || sender.send(SessionRequest { request }).await.is_err() {

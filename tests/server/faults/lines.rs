@@ -13,7 +13,7 @@ use std::{
 const CLIENTS: usize = 60;
 const ENVS: usize = 5;
 const STEPS: usize = 40;
-/// The number of bytes within which a fault happens: about the length of a client's whole session.
+/// The maximum number of bytes before a fault of a connection: about the length of a client's whole session.
 const MOST: u64 = 20_000;
 /// Short timeouts, so that half-open connections are given up soon.
 const PATIENCE: Timeouts = Timeouts {
@@ -64,7 +64,7 @@ async fn faults_of_lines_end_sessions_and_change_none() {
     let (mut happened, mut noticed) = (0, 0);
     for (course, faults, seen, error) in courses.lock().unwrap().iter() {
         let kind = course.from_server.or(course.from_client).map(|fault| fault.kind);
-        // Nothing protects bytes against changes, so a flipped bit may change a result.
+        // Connections without TLS do not protect bytes against changes, so a flipped bit may change a result.
         assert!(kind == Some(FaultKind::BitFlip) || truth.starts_with(seen), "{course:?} changed what was seen");
         assert!(*faults > 0 || error.is_none(), "{course:?}: nothing happened, but {error:?}");
         (happened, noticed) = (happened + faults, noticed + usize::from(error.is_some()));

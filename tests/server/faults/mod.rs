@@ -1,5 +1,5 @@
-//! Invalid requests, faulty clients and faulty connections. Each is tried while another session steps; its bytes must
-//! equal those of an undisturbed run.
+//! Invalid requests, faulty clients and faulty connections. Each fault happens while another session steps. The bytes
+//! of this session must equal the bytes of an undisturbed run.
 
 mod clients;
 mod lines;

@@ -30,7 +30,8 @@ async fn refusals(session: &mut Session, requests: impl IntoIterator<Item = Requ
     lines
 }
 
-/// Does the same in an open session, whose bytes must then equal those of an undisturbed session.
+/// Sends requests that must be refused in an open session. Asserts that the session's later bytes equal the bytes of an
+/// undisturbed session. Returns a line with the refusal of each request.
 async fn harmless_refusals(address: &str, e: &Environment, n: u32, requests: Vec<Request>) -> String {
     let (mut session, _) = Session::open(address, open(&e.name, n, 1)).await;
     let (mut twin, _) = Session::open(address, open(&e.name, n, 1)).await;
@@ -98,7 +99,7 @@ async fn wrong_requests_before_open_are_refused_and_open_still_works() {
     ];
     let mut session = Session::connect(server.unix()).await;
     assert_snapshot!(refusals(&mut session, wrong).await);
-    // Refused requests have left nothing behind: all remaining environments can be opened.
+    // Refused requests occupy nothing: all remaining environments can be opened.
     let opened = session.ask(Open { batch_size: 997, first_environment_index: u32::MAX - 996, ..base() }).await;
     assert_eq!(opened.started[996].episode.as_ref().unwrap().environment_index, u32::MAX);
     assert_snapshot!(refusals(&mut session, [Request::Open(base())]).await, @"FailedPrecondition: open came on a session that is open already; use reset, or start another session");

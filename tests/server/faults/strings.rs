@@ -96,7 +96,7 @@ async fn what_goes_wrong_in_a_library_on_clients_demand_is_not_logged() {
         b"GET / HTTP/1.1\r\n\r\n",
     ] {
         let mut connection = TcpStream::connect(server.port()).unwrap();
-        // Ignored: the server may close the connection before it has read everything.
+        // An error is ignored, because the server may close the connection before it has read everything.
         let _ = connection.write_all(&[PREFACE, frames].concat());
         let _ = std::io::Read::read_to_end(&mut connection.try_clone().unwrap(), &mut Vec::new());
     }

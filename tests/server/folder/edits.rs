@@ -71,8 +71,8 @@ fn environment(name: &str, edit: &str, bounds: (f64, f64, f64), model: &str) -> 
     (spec.make)().unwrap()
 }
 
-/// Returns the complete state after each of some steps with random actions. In the initial state the box slides, the
-/// ball rolls and spins, and the puck slides.
+/// Takes steps with random actions. Returns the complete state after each step. In the initial state the box slides,
+/// the ball rolls and spins, and the puck slides.
 fn trajectory(environment: &mut dyn Environment) -> Vec<Vec<f64>> {
     let spec = environment.spec();
     let mut state = vec![0.0; spec.state.len()];
@@ -111,7 +111,8 @@ fn difference(a: &[Vec<f64>], b: &[Vec<f64>]) -> f64 {
     each.map(|(a, b)| (a - b).abs() / a.abs().max(1.0)).fold(0.0, f64::max)
 }
 
-/// No tolerance: the edit writes the same number as the compiler, and MuJoCo computes the rest in the same way.
+/// The tolerance is 0 where the edit writes the same number as the compiler, and MuJoCo computes the rest in the same
+/// way.
 const EXACT: f64 = 0.0;
 /// The tolerance where the compiler computes mass and inertia from a density or a scaled geom, and the edit scales both
 /// by a factor.

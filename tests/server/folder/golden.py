@@ -4,7 +4,7 @@ The .npz has three episodes of up to 40 steps of each of Gymnasium 1.4's eleven 
 mujoco 2.2.2: for each `task/seed` the arrays qpos [Q], qvel [V] of the initial state, actions [T, A] (float32),
 observations [T + 1, O], rewards [T] and terminated [T]. The .bin has for each episode, little-endian: the length of the
 task's name and the seed as u16, the name, Q, V, A, O and T as u16, then qpos and qvel as f64, the actions and the
-observations as f32, the rewards as f64, and for each step a byte that is 1 if it terminated.
+observations as f32, the rewards as f64, and for each step a byte that is 1 if the step terminated the episode.
 """
 
 import ast
@@ -14,7 +14,7 @@ import zipfile
 
 
 def load(archive: zipfile.ZipFile, name: str) -> tuple[str, tuple[int, ...], bytes]:
-    """An array: its type, its shape and its bytes, row-major."""
+    """Reads an array. Returns its type, its shape and its bytes, row-major."""
     raw = archive.read(name)
     length = struct.unpack("<H", raw[8:10])[0]
     header = ast.literal_eval(raw[10 : 10 + length].decode())

@@ -15,7 +15,7 @@ use std::{
 const ASSETS: &str = "PERTURB_TEST_GYMNASIUM_ASSETS";
 /// The recorded episodes, written by golden.py.
 const GOLDEN: &[u8] = include_bytes!("../data/gymnasium_mujoco.bin");
-/// The relative tolerance of rewards: they are sent as f32, and NumPy adds in another order.
+/// The relative tolerance of rewards. Rewards are sent as f32, and NumPy adds their terms in another order.
 const REWARD_TOLERANCE: f64 = 1e-6;
 
 /// The names of tasks in the recorded data, and the names of their files.
@@ -156,8 +156,8 @@ fn check_describes_all_eleven_without_a_warning() {
     }
 }
 
-/// Scales all masses of an MJCF text: densities and masses of geoms. Geoms with neither, not even by a default, have
-/// MuJoCo's density of 1000.
+/// Scales all masses of an MJCF text: densities and masses of geoms. A geom without a density and a mass, own or
+/// default, has MuJoCo's density of 1000 kg/m³.
 fn with_scaled_masses(mjcf: &str, factor: f64) -> String {
     let given = ["density", "mass"];
     let names_mass = |tag: &str| given.iter().any(|name| tag.contains(&format!(" {name}=\"")));
@@ -196,8 +196,8 @@ fn scaled(mjcf: &str, element: &str, key: &str, factor: f64) -> Option<String> {
     (text != mjcf).then_some(text)
 }
 
-/// Returns the MJCF text that corresponds to an edit of the compiled model. Frictions are left out, because texts write
-/// them too differently; edits.rs has a model for them.
+/// Returns the MJCF text that corresponds to an edit of the compiled model. Frictions are left out, because the tasks'
+/// texts write them in too many ways. The tests in edits.rs cover frictions.
 fn recompiled(mjcf: &str, edit: &str) -> Option<String> {
     let option = |attribute: &str| {
         let (before, after) = mjcf.split_once("<option ")?;
@@ -267,8 +267,8 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
             let difference = |(a, b): (&f64, &f64)| (a - b).abs() / a.abs().max(1.0);
             let differences = edited.iter().zip(&fresh).map(difference);
             let largest = differences.fold(0.0, f64::max);
-            // The compiler multiplies volumes by scaled densities, and the edit scales rounded masses. Contacts amplify
-            // the difference.
+            // Rounding differs: the compiler multiplies volumes by scaled densities, and the edit scales rounded
+            // masses. Contacts amplify the difference.
             let tolerance = if edit == "mass" { 1e-6 } else { 0.0 };
             assert!(largest <= tolerance, "{name}: {edit}: {largest:e} after at least 100 timesteps");
             compared += 1;

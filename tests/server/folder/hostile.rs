@@ -1,4 +1,4 @@
-//! Models on which MuJoCo aborts, or which need all memory: the server refuses to start, and says why.
+//! Models that make MuJoCo abort or use all memory. The server refuses to start with such a model, and says why.
 
 use super::{CART, TASK, folder};
 use crate::common::server;

@@ -56,7 +56,7 @@ fn assert_is(environment: &mut dyn Environment, mjcf: &str, about: &str) {
     }
 }
 
-/// Replaces numbers in a text. Asserts that each occurs the given number of times.
+/// Replaces numbers in a text. Asserts that each number occurs the given number of times.
 fn replaced(text: &str, changes: &[(&str, String, usize)]) -> String {
     changes.iter().fold(text.to_owned(), |text, (old, new, times)| {
         assert_eq!(text.matches(old).count(), *times, "{old}");
@@ -258,7 +258,7 @@ fn environments_of_other_lengths_take_turns_unseen() {
     for (environment, length) in together.iter_mut().zip(lengths) {
         environment.set_parameters(&[1.2, length, 0.04, 0.0]);
     }
-    // Done twice: models from the cache must equal freshly compiled ones.
+    // Runs twice, because models from the cache must equal freshly compiled models.
     for _ in 0..2 {
         let found: Vec<Vec<u64>> = together.iter_mut().map(|environment| trajectory(environment.as_mut())).collect();
         assert_eq!(found, alone);

@@ -174,7 +174,8 @@ fn huge_actions_make_finite_rewards() {
     assert_eq!(terms, [1.0, -1e30]);
 }
 
-/// Plays an episode of 5 steps with a constant action. Returns what it achieved, and whether it was a success.
+/// Plays an episode of 5 steps with a constant action. Returns the achieved value, and whether the episode was a
+/// success.
 fn achieved(name: &str, success: &str) -> (Option<f64>, bool) {
     let spec = with(name, &[("success", success), ("step_limit", "step_limit = 5")]);
     let distributions = spec.distributions(Version::D);

@@ -1,4 +1,4 @@
-//! Invalid folders: the message, the place and the exit status for each.
+//! Tests that invalid folders are refused, with the right message, file, line and exit status.
 
 use super::{CART, TASK, folder};
 use crate::common::server;

@@ -155,7 +155,7 @@ fn an_environment_takes_less_than_eight_kilobytes() {
         );
         let mut state = Vec::new();
         environment.save(&mut state);
-        // Everything that an environment keeps: its saved state, and its part of the edited model.
+        // An environment keeps its saved state and its part of the edited model. Both must be small.
         assert!(8 * state.len() < 4096, "{}: {} numbers", spec.name, state.len());
     }
 }

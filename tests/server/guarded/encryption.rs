@@ -114,7 +114,7 @@ async fn a_server_may_ask_for_certificates_of_clients() {
     assert!(words.contains("asks for a client's certificate; set PERTURB_CERT"), "{words}");
     let half = unsafe_words(connect(encrypted.address(), &[(CA, &encrypted.ca), (CERT, &good.cert)]).await);
     assert!(half.contains("PERTURB_KEY is not"), "{half}");
-    // The end of the server is no certificate error, so the client retries.
+    // An error because the server ends is not a certificate error, so clients retry.
     encrypted.server.signal("TERM");
     let error = with(&good).await.unwrap_err();
     assert!(error.is_absence() && error.to_string().contains("shutting down"), "{error}");

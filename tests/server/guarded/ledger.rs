@@ -105,7 +105,7 @@ async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
     assert_eq!(kinds, ["began", "ann", "begins", "ends", "ended"]);
     assert!(guarded.server.log().contains("head="), "{}", guarded.server.log());
 
-    // Another server continues the ledger, but refuses a changed one.
+    // Another server continues the ledger, but refuses a ledger that was changed.
     let flags = ["--ledger", path.to_str().unwrap()];
     let server = Server::start(&flags);
     assert_eq!(self::entries(&path).len(), 6);
@@ -194,7 +194,7 @@ async fn ledger_withdraws_draws_that_did_not_happen() {
     until("it is taken back", async || draws(&path).len() == 3).await;
     assert_eq!(draws(&path)[2].ends, [DrawEnd { seed: 9, index: 0, count: 1, episode: None }]);
 
-    // A snapshot of an ended episode, which same-step mode refuses.
+    // Takes a snapshot of an ended episode. A session in same-step mode refuses such a snapshot.
     drop(session);
     until("there is room", async || draws(&path).len() == 4).await;
     let disabled = Open { autoreset_mode: AutoresetMode::Disabled.into(), ..open("CartPole", 1, 5) };

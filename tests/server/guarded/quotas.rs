@@ -44,14 +44,14 @@ async fn sessions_of_a_token_share_its_rate() {
     let (mut one, mut other) = (session(&guarded, ANN, open(1)).await, session(&guarded, ANN, open(2)).await);
     let mut bob = session(&guarded, BOB, open(1)).await;
     let ((slow, took), (_, its)) = tokio::join!(timed(&mut one, ENVS, 10), timed(&mut other, ENVS, 10));
-    // In total 400 steps at 200 a second. Nobody waits for the last step of a session, and an idle token may make up
-    // for one second.
+    // The sessions take 400 steps in total, at 200 steps a second. No request waits for the last step of a session, and
+    // an idle token may run one second's steps at once.
     let least = Duration::from_secs_f64((400.0 - 2.0 * ENVS as f64) / 200.0 - 1.0);
     assert!(took.max(its) > least, "{took:?}, {its:?}");
     let (fast, took) = timed(&mut bob, ENVS, 10).await;
     println!("another's ten steps took {took:?}");
     assert!(fast == slow, "a rate changes no number");
-    // So many steps exceed the rate by some seconds, no matter how long the next request takes.
+    // The following steps exceed the rate by some seconds, so the session waits, however long each request takes.
     let (_, took) = timed(&mut one, ENVS, 20).await;
     assert!(took > Duration::from_secs_f64(0.8), "{took:?}");
     // Over the Unix socket no token is required, and no rate applies.
@@ -157,7 +157,7 @@ async fn session_is_resumed_although_its_token_is_ahead_of_its_rate() {
     assert_eq!(session.refused(step()).await.0, Code::ResourceExhausted, "40 s are too long to wait");
 }
 
-/// Returns the time that `count` requests take, after the first ones, for a token with 1 000 steps a second.
+/// Returns the time that `count` further requests take, for a token with a rate of 1000 steps a second.
 async fn paced(session: &mut Session, count: usize, request: impl Fn() -> Request) -> Duration {
     let start = Instant::now();
     for _ in 0..count {
@@ -188,8 +188,8 @@ async fn requests_cost_as_much_of_the_rate_as_steps(#[case] kind: &str, #[case] 
         _ => Request::Render(Render { slot: 0, width: 200, height: 200 }),
     })
     .await;
-    // Each request costs at least 20 steps, or 39 for a picture. The token may make up for one second, and nobody waits
-    // for the last request.
+    // Each request costs at least 20 steps, or 39 for a picture. An idle token may run one second's steps at once, and
+    // no request waits for the last request.
     assert!(took.as_secs_f64() >= 0.9, "{kind}: {took:?}");
 }
 
@@ -229,7 +229,8 @@ async fn a_rate_bounds_how_fast_the_ledger_grows() {
     }
     let seconds = start.elapsed().as_secs_f64();
     let bytes = std::fs::metadata(guarded.directory.path().join("ledger")).unwrap().len() as f64;
-    // docs/access.md says 16 bytes a step. The token may make up for one second, and the last request does not wait.
+    // docs/access.md says that 16 bytes cost a step. An idle token may run one second's steps at once, and the last
+    // request does not wait.
     let most = 16.0 * RATE as f64 * (seconds + 1.0) + 10_000.0;
     println!("{bytes} bytes in {seconds} s, at most {most}");
     assert!(bytes < most, "{bytes} bytes in {seconds} s");

@@ -95,13 +95,13 @@ async fn no_other_way_leads_around_a_role() {
     };
     denied(within(Stream::open(&ann, groups)).await);
 
-    // A snapshot that another token has saved.
+    // Takes a snapshot in a session of another token.
     let bob = guarded.connect(BOB).await;
     let (mut other, _) = within(Stream::open(&bob, of(Version::Extreme, &[]))).await.unwrap();
     let foreign = within(other.ask(Snapshot::default())).await.unwrap().snapshots;
     denied(within(session.ask(Restore { snapshots: foreign, ..Restore::default() })).await);
-    // Values outside the snapshot's distributions. The server would draw no such values, but they would stay in force
-    // until the trial ends.
+    // Forges snapshots with values outside the snapshot's distributions. The server would never draw such values, but
+    // after a restore they would stay in force until the trial ends.
     let (mut fixed, _) = within(Stream::open(&bob, of(Version::Random, &[("length", 0.35, 0.35)]))).await.unwrap();
     let own = within(fixed.ask(Snapshot::default())).await.unwrap().snapshots;
     let forged = own.iter().map(|snapshot| with_length(snapshot, 1.5)).collect();
@@ -113,11 +113,12 @@ async fn no_other_way_leads_around_a_role() {
     within(Stream::open(&neighbour, of(Version::Extreme, &[]))).await.expect("a Unix socket has its own guard");
 }
 
-/// Returns the snapshot of a pole of length 0.35 with another length in force, and a correct checksum.
+/// Returns a snapshot of a pole of length 0.35 m with its current length changed to `length`, and with a correct
+/// checksum.
 fn with_length(snapshot: &[u8], length: f64) -> bytes::Bytes {
     let mut forged = snapshot[..snapshot.len() - 4].to_vec();
     let old = 0.35f64.to_le_bytes();
-    // The number occurs twice in the distribution and then as the value.
+    // The length occurs three times in the snapshot: twice in the distribution, and then as the current value.
     let places: Vec<usize> = (0..forged.len() - 8).filter(|&place| forged[place..place + 8] == old).collect();
     assert_eq!(places.len(), 3);
     forged[places[2]..places[2] + 8].copy_from_slice(&length.to_le_bytes());

@@ -1,4 +1,4 @@
-//! Insecure settings, which are refused before a port is bound, and secure ones.
+//! Insecure settings, which are refused before a port is bound, and secure settings.
 
 use super::connect;
 use crate::common::server::{Server, command};
@@ -114,7 +114,7 @@ fn a_socket_has_its_mode(#[case] flags: &[&str], #[case] mode: u32) {
 fn health_is_asked_through_tls(#[case] is_own: bool) {
     let directory = tempfile::tempdir().unwrap();
     let authority = Authority::new("authority");
-    // The certificate has no name of the loopback interface.
+    // The certificate does not have the name or address of the loopback interface.
     let pair = authority.issue(directory.path(), "server", &["example.org"], 2040);
     let other = authority.issue(directory.path(), "other", &["example.org"], 2040);
     let [cert, key] = [&pair.cert, &pair.key].map(|path| path.to_str().unwrap());

@@ -142,7 +142,8 @@ async fn a_token_has_its_quotas() {
     let six = begin(&ann, 6).await.unwrap();
     let words = refused(begin(&guarded.connect(ANN).await, 3).await.map(drop));
     assert!(words.contains("\"ann\" may have 8 environments"), "{words}");
-    // The refused session frees its place as soon as its connection's thread learns that the client has disconnected.
+    // The refused session returns its part of the quota as soon as its connection's thread learns that the client has
+    // disconnected.
     let mut two = None;
     crate::common::server::until("its place can be had", async || {
         two = begin(&ann, 2).await.ok();

@@ -66,7 +66,8 @@ async fn stored_replies_are_budgeted_and_dropped_for_room() {
     let empty = watched.page().number("perturb_in_flight_bytes");
     let picture = || Render { slot: 0, width: 512, height: 512 };
     session.ask(picture()).await;
-    // The stored picture and the overhead of a reply. The memory for sending it is already free.
+    // The budget counts the stored picture and the overhead of a reply. The memory for sending the picture is already
+    // free.
     let kept = empty + PICTURE as f64;
     until("one is kept", async || (kept..kept + 2e3).contains(&watched.page().number("perturb_in_flight_bytes"))).await;
     for _ in 1..20 {

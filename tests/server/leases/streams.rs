@@ -47,7 +47,8 @@ async fn session_over_a_breaking_line_has_the_same_bytes(#[case] ahead: u32) {
     let expected = undisturbed(server.tcp(), STEPS).await;
     let described = environment(server.tcp(), "CartPole").await;
     for seed in 0..4 {
-        // The first connection must last until the session is open. Some of the others break before they resume it.
+        // The first connection must last until the session is open. Some of the other connections break before they
+        // resume the session.
         let most = move |number| if number == 0 { 20_000 } else { mixed(mixed(seed) ^ number as u64) as usize % 6_000 };
         let (proxy, connection) = connect(&server, most).await;
         let (mut stream, _) = within(Stream::open(&connection, leased(ahead))).await.unwrap();

@@ -112,7 +112,7 @@ async fn what_was_under_way_when_the_connection_broke_is_done() {
     let expected = twin.ask(act()).await;
     let (session, opened) = Session::open(server.tcp(), Open { lease: 1, ..game.open() }).await;
     session.send(act()).await;
-    // After this time, the request is being answered, or it has not been read yet.
+    // After this pause, the server either is answering the request or has not read it yet.
     tokio::time::sleep(std::time::Duration::from_millis(20)).await;
     drop(session);
     let (mut session, resumed) = resume(server.tcp(), &opened.lease, 0).await;

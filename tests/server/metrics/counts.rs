@@ -1,4 +1,4 @@
-//! Counters have the right values after known requests.
+//! Tests that counters have the right values after known requests.
 
 use super::Watched;
 use crate::{

@@ -11,7 +11,7 @@ use std::{
 
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A metrics page, and its values by name with labels, as written on the page.
+/// A metrics page, and its values. The key of a value is its name with labels, as written on the page.
 #[derive(Debug)]
 pub struct Page {
     pub text: String,

@@ -98,7 +98,7 @@ async fn another_environment_is_what_its_equations_say() {
     let (mut session, _) = Session::open(&server.address, exact).await;
     session.ask(Reset { states: doubles(&[0.0, 0.0]), ..Reset::default() }).await;
     let step = session.step(1.0f32.to_le_bytes().to_vec().into()).await;
-    // Mass 1 kg, drag 0.5, a force of 1 N for 0.1 s.
+    // The ball has a mass of 1 kg and a drag of 0.5. A force of 1 N acts for 0.1 s.
     assert_eq!(floats(&step.observations), [0.01, 0.1]);
     let refused = Open { parameters: parameters(&[("drag", &[(-1.0, -1.0)])]), ..open("Ball", 1, 1) };
     let mut session = Session::connect(&server.address).await;
