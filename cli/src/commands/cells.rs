@@ -31,7 +31,7 @@ pub(super) struct PlanRunner<'a> {
     plan: Plan,
     /// Failed cells of an earlier run, by id. --retry-failed runs them again.
     retryable: HashMap<String, FailureId>,
-    /// End of the last round; `None` before the first round.
+    /// Outcome of the previous round; `None` before the first round.
     end: Option<RunEnd>,
     /// Success rates of the finished cells, by kind of cell (environment, method and training set).
     rates: Vec<Rate>,

@@ -202,7 +202,7 @@ fn test(args: &CompareArgs, conditions: Vec<NamedPolicies>, sets: &[TestSet]) ->
     let policies = || conditions.iter().flat_map(|condition| &condition.policies);
     let plays = policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Trained(_)));
     if plays && policies().any(|(_, policy)| matches!(policy, ComparedPolicy::Recorded(_))) {
-        note("recorded episodes are compared with episodes that are played now: they may be different ones");
+        note("recorded tests are compared with tests that run now: their episodes may differ");
     }
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = plays.then(|| playing_servers(&args.play, &stop)).transpose()?;

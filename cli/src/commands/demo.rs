@@ -33,7 +33,7 @@ use crate::video::{VideoError, VideoFile, VideoOptions, film};
 const PAPER_EPISODES: u64 = 15_000;
 /// Number of episodes of each test in the paper.
 const PAPER_TEST_EPISODES: u64 = 1000;
-/// Number of runs in the paper, over which it gives means.
+/// Number of runs in the paper. Its results are means over these runs.
 const PAPER_RUNS: u64 = 5;
 /// Versions on which policies are trained.
 const TRAINED_ON: [Version; 2] = [Version::D, Version::R];

@@ -41,7 +41,7 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
         return Err(CommandError::Usage(message));
     }
-    // The run creates --out and the folders above it, so a page there needs no existing folder.
+    // The run creates --out and the folders above it, so the folder of a page in one of them need not exist yet.
     let is_created = |page: &Path| {
         let is_related = |folder: &Path| args.out.starts_with(folder) || folder.starts_with(&args.out);
         !page.exists() && page.parent().is_some_and(is_related)

@@ -75,7 +75,7 @@ pub struct SetArgs {
     /// A list of parameters to test on: a CSV file whose header names parameters, with a row for each context.
     #[arg(long, value_name = "FILE", conflicts_with = "parameters")]
     pub contexts: Option<PathBuf>,
-    /// Version of the parameters that --parameters or --contexts do not name.
+    /// Version from which all parameters are drawn that --parameters or --contexts do not name.
     #[arg(long, value_name = "VERSION", default_value = "D")]
     pub base_version: Version,
 }
@@ -213,7 +213,7 @@ pub struct VideoArgs {
     /// contact sheet shows them side by side.
     #[arg(long, value_delimiter = ',', default_value = "D")]
     pub version: Vec<Version>,
-    /// Parameters that replace the version's: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
+    /// Parameters that replace those of the version: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
     /// Number of episodes on each version. For a policy trained with RL² all episodes of a trial are shown.

@@ -40,8 +40,8 @@ pub struct TrainArgs {
     /// Version of the environment's parameters: D (the defaults), R (random), E (extreme) or R+E [default: D].
     #[arg(long)]
     pub version: Option<Version>,
-    /// Parameters that replace the version's: a value, or intervals to draw from, e.g. length=0.3..0.4,0.8..0.9
-    /// mass=0.1.
+    /// Parameters that replace those of the version: a value, or intervals to draw from, e.g.
+    /// length=0.3..0.4,0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
     /// Defaults of the settings: perturb's recommended ones, or those of the paper's authors [default: perturb].

@@ -25,7 +25,7 @@ use crate::commands::{plan_in, playing_servers, refuse_file, require_default_out
 struct HeatmapCounts {
     /// Number of heatmaps to make: one for each selected policy whose environment has the parameters of both axes.
     total: usize,
-    /// Number of these heatmaps that could not be made.
+    /// Number of heatmaps in `total` that could not be made.
     failed: usize,
     /// Number of environments that lack the parameter of an axis.
     skipped_environments: usize,
