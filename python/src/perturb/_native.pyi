@@ -137,8 +137,8 @@ class Player:
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None: ...
 
-# The fields of results.PolicyMetadata: training version, training steps, seed and episodes of the tests, observations,
-# and whether the policy was deterministic.
+# The fields of results.PolicyMetadata: training version, training steps, seed and episodes of the tests, what the policy
+# observed (`state` or `parameters`), and whether the policy was deterministic.
 PolicyMetadata: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
 
 class Assessment:
@@ -160,7 +160,10 @@ def compare(
 def compare_rows(
     conditions: list[tuple[str, list[dict[str, Any]]]], sets: list[str] | None, score: str, baseline: str | None
 ) -> str:
-    """Compare conditions of rows of a results table in the tests on these sets, or on all common ones, as JSON."""
+    """Compare conditions that consist of rows of a results table, in the tests on these sets. Return JSON.
+
+    If `sets` is None, the tests are those on all sets that the conditions have in common.
+    """
 
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:
     """Return the report page of assessments, and of the folders `beside` with experiments and assessments, as HTML."""
@@ -249,4 +252,4 @@ def metrics(rates: dict[str, float]) -> tuple[float | None, float | None, float 
     """Return Default, Interpolation and Extrapolation, %, from success rates, %, by scenario such as `DR`."""
 
 def published(environment: str) -> list[tuple[str, list[tuple[float, float | None] | None]]]:
-    """Return the paper's methods, each with the mean and standard deviation of its three metrics, %."""
+    """Return the paper's results: for each method, the mean and standard deviation of its three metrics, %."""

@@ -1,4 +1,4 @@
-"""The client of a server: the settings and the session that a single environment and a batch have in common."""
+"""The client of a server. It is the part that `PerturbEnv` and `PerturbVectorEnv` have in common."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class ResetRequest(NamedTuple):
 
     # Bool [N], true for the M environments to reset; None resets all.
     mask: NDArray[np.bool_] | None
-    # M seeds. Empty continues with the next episode of each environment's last seed.
+    # M seeds. If empty, each environment continues with the next episode of its last seed.
     seeds: Sequence[int]
     # Intervals that replace earlier ones, by parameter.
     parameters: requests.Intervals
@@ -85,14 +85,16 @@ class Client:
             local_server.find_program()  # so that a missing program is reported now, not at the first reset
         self._single = single
         self._parameters = requests.distributions(parameters)
-        # For each environment, the parameters that replace those of the batch. Empty if no environment has its own.
+        # For each environment, the parameters that replace the parameters of the batch. The list is empty if no
+        # environment has parameters of its own.
         self._own: list[requests.Intervals] = []
         if contexts is not None:
             self._set_contexts(requests.contexts(contexts))
         named = {*self._parameters, *(name for own in self._own for name in own)}
         self.description = self.description.with_parameters(named)
         if self.description.is_disturbed:
-            # A session has disturbances only if the parameters that open it name one. Contexts are sent later.
+            # A session has disturbances only if the request that opens it names a disturbance. Contexts are sent later,
+            # so add a disturbance to the opening request, with the value that has no effect.
             first, value = next(iter(self.description.undisturbed.items()))
             self._parameters = {first: [(value, value)], **self._parameters}
         if observe_parameters:
@@ -133,14 +135,14 @@ class Client:
         return self._session
 
     def open(self, seeds: Sequence[int], generator: np.random.Generator) -> OpenedSession | None:
-        """Open a session if none is open. Return None if one is open already.
+        """Open a session and begin the first episodes. If a session is open already, return None and do nothing.
 
-        The environments begin with the first of `seeds`, or with a seed that the generator draws if there are none.
-        Each environment keeps the parameters that its context or an earlier reset set.
+        `seeds[0]` is the seed of the batch. If `seeds` is empty, the generator draws the seed. Each environment has the
+        parameters of its context. Parameters that earlier resets set replace these.
 
         Raises:
-            OutOfOrderError: if the last session was lost after a snapshot had been restored in it. Then the parameters
-                are not known.
+            OutOfOrderError: if a snapshot was restored in the last session, and that session was lost. The parameters
+                in the snapshot are not known, so a new session cannot have them.
         """
         self._require_not_closed()
         if self._session is not None:
@@ -169,7 +171,7 @@ class Client:
             if self._task is not None:
                 self.description.require_same_model(served)
             begun = OpenedSession(opened, opened.observations, opened.events)
-            if any(self._own):  # environments with parameters of their own get them by resets
+            if any(self._own):  # some environments have parameters of their own, which resets set
                 begun = self._give_own(session, opened, seed)
         except BaseException:
             session.close()
@@ -194,7 +196,7 @@ class Client:
         self._own = [fixed[slot % count] for slot in range(self.num_envs)]
 
     def _give_own(self, session: Session, opened: Opened, seed: int) -> OpenedSession:
-        """Set the parameters of each environment. Environments with equal parameters share one request."""
+        """Set the environments' own parameters by resets, one for each group of environments with equal parameters."""
         slots: dict[Any, list[int]] = {}
         for slot, own in enumerate(self._own):
             if own:
@@ -203,7 +205,7 @@ class Client:
             mask = np.zeros(self.num_envs, np.bool_)
             mask[alike] = True
             session.reset(mask.tobytes(), [seed] * len(alike), self._own[alike[0]], b"")
-        # Begin the same episodes again, all in one reset.
+        # Begin the first episodes once more, all in one reset, so that one reply has all observations and episodes.
         return OpenedSession(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
 
     def reset(self, groups: Sequence[ResetRequest]) -> tuple[NDArray[np.float32], list[Events]]:
@@ -242,7 +244,8 @@ class Client:
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
         """Restore snapshots into the environments that the mask selects. None selects all.
 
-        Returns the observations [N, O] of all environments. Environments that are not selected have their last ones.
+        Returns the observations [N, O] of all environments. Environments that are not selected have their last
+        observations.
         """
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")

@@ -49,12 +49,13 @@ if TYPE_CHECKING:
 Reply = TypeVar("Reply")
 
 # Interval of keepalive pings to a silent server, and maximum time to wait for their answer, s. The maximum is long, so
-# that a busy machine does not lose environments. When a server ends, its operating system closes its sockets at once.
+# that environments are not lost while a machine is busy. A long maximum does not delay the notice of a server's end,
+# because the operating system then closes the server's sockets at once.
 KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
 # Interval at which idle sessions answer the server's keepalive pings, s.
 POLL_INTERVAL = 0.25
-# A pause of this process may explain a lost connection: minimum length of such a pause, and time for which it is
-# remembered, s.
+# A pause of this process (such as Ctrl-Z) may explain a lost connection, and error messages then say so. Minimum length
+# of such a pause, and the time after it in which error messages consider it, s.
 PAUSE_LIMIT, PAUSE_MEMORY = 2.0, 60.0
 # gRPC status codes with which a server ends a stream.
 DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 4, 8, 11, 12, 16
@@ -85,13 +86,13 @@ class Session:
             self._local = local_server.acquire(LocalServer, task)
             server = self._local.address
         elif server == EMBEDDED:
-            with embedded_server.loading:  # lock order: this lock before the lock of the shared servers
+            with embedded_server.loading:  # lock order: this lock before the lock of `local_server`
                 self._local = local_server.acquire(EmbeddedServer, task)
         self.address: Address = server
         self._owner = os.getpid()
         self._limit = timeout
         self._embedded = server == EMBEDDED
-        # Resets and steps of a task from a folder may compile a model again.
+        # Whether resets and steps may compile a model in this process, as those of a task from a folder may.
         self._compiles = self._embedded and task is not None
         self._lost: str | None = None
         self._opened = False
@@ -105,7 +106,8 @@ class Session:
             single,
         )
         self._resources: _Resources = (self._native, self._local, self._owner)
-        # Python may delete a session at any time, also while a lock is held, so the finalizer only notes the resources.
+        # Python may delete a session at any time, also while this thread holds a lock that closing needs. The finalizer
+        # therefore only appends the resources to `_unclosed`.
         self._forget = weakref.finalize(self, _unclosed.append, self._resources)
         self._forget.atexit = False  # _at_exit closes the remaining sessions
         try:
@@ -148,7 +150,8 @@ class Session:
 
     def _gone(self) -> str | None:
         """Return the reason why the session has ended, or None if it has not."""
-        # If a second Ctrl-C interrupts the handling of the first, the native session has ended without a reason here.
+        # `_failed` stores the reason in `_lost`. If a second Ctrl-C interrupts it, the native session has ended, but no
+        # reason is stored.
         return self._lost or ("it was interrupted, or its connection ended" if self._native.ended else None)
 
     def open(self, **request: Any) -> _native.Opened:
@@ -234,7 +237,7 @@ class Session:
         loads = self._compiles or (self._embedded and kind in ("open", "render"))
         try:
             if loads:
-                # The lock is released before `_failed` closes the session and takes the lock of the shared servers.
+                # Release this lock before `_failed` closes the session, which takes the lock of `local_server`.
                 with embedded_server.loading:
                     return call(*arguments, **fields)
             return call(*arguments, **fields)
@@ -249,7 +252,8 @@ class Session:
         if not isinstance(error, _native.Failure):
             if not self._native.ended:
                 return error  # the actions had a wrong shape or type, and nothing was sent
-            # Ctrl-C interrupted the wait. The late reply would be taken for the reply to the next request.
+            # Ctrl-C interrupted the wait for the reply, so end the session. Otherwise the late reply would be taken for
+            # the reply to the next request.
             self._lost = self._lost or f"the wait for the reply to {kind} was interrupted"
             self._close()
             return error
@@ -258,7 +262,7 @@ class Session:
             if code == UNAUTHENTICATED:  # a token that is missing, wrong or revoked ends the stream
                 return self._fail(self._explain(kind, what, code, words))
             refused = refusal(kind, code, words)
-            # A refused request changes nothing. A bug in the server ends the session.
+            # A refused request changes nothing, so the session continues. Only a bug in the server ends the session.
             return self._fail(refused) if isinstance(refused, ServerDefectError) else refused
         if what == "malformed":
             return ProtocolError(words)
@@ -295,7 +299,7 @@ class Session:
                 f"{where} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
-        if code == UNAUTHENTICATED and what == "unreachable":  # certificates, or the files that variables name
+        if code == UNAUTHENTICATED and what == "unreachable":  # a wrong certificate, or file that a variable names
             return ServerConnectionError(f"no safe connection to {where}: {words}")
         if code == UNAUTHENTICATED:
             return ServerConnectionError(f"{where} refuses this process: {words}")
@@ -315,7 +319,7 @@ class Session:
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
         pause = _keepalive.longest_pause()
-        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # with this code the server ends idle sessions itself
+        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # with this code, the server ended an idle session
             return ServerConnectionError(
                 f"{lost}: {words}. This process did not run for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
                 "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "
@@ -337,13 +341,17 @@ def _listen(address: Address) -> str:
 # Resources of a session that must be closed: the stream, the private or embedded server, and the id of the process that
 # opened the session.
 _Resources: TypeAlias = "tuple[_native.Session, LocalServer | EmbeddedServer | None, int]"
-# Resources of sessions that were deleted without a call of `close`. The next call that opens or closes a session closes
-# them, or the keepalive thread does.
+# Resources of sessions that were deleted without a call of `close`. They are closed by the keepalive thread, or by the
+# next call that opens or closes a session.
 _unclosed: collections.deque[_Resources] = collections.deque()
 
 
 def _close_unclosed(*, wait: bool = True) -> None:
-    """Close the resources of deleted sessions. If `wait` is false, stop if another thread starts a server."""
+    """Close the resources of deleted sessions.
+
+    Another thread may be starting a server, and then holds a lock that is needed here. If `wait` is false, leave the
+    remaining resources for a later call instead of waiting for that lock.
+    """
     with contextlib.suppress(IndexError):  # another thread may have taken the last entry
         while True:
             resources = _unclosed.popleft()
@@ -355,7 +363,7 @@ def _close_unclosed(*, wait: bool = True) -> None:
 def _close(
     native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int, *, wait: bool = True
 ) -> bool:
-    """Close a session's resources. Return False if the server was not released, and the caller must call again."""
+    """Close a session's resources. Return False if the server could not be released; the caller must call again."""
     if os.getpid() != owner:
         return True  # resources that a forked process inherited belong to its parent
     native.close()  # a second call does nothing
@@ -376,7 +384,7 @@ class _KeepaliveThread:
         self._ended = threading.Event()
         # Time of the thread's last run, s. The clock also counts while the computer is suspended.
         self._last_run = _now()
-        # Length and end of the longest recent pause, s.
+        # The longest recent pause of this process: its length, and the time of its end, s.
         self._pause = (0.0, 0.0)
 
     def longest_pause(self) -> float:
@@ -399,13 +407,13 @@ class _KeepaliveThread:
                 self._thread = start_thread("perturb-keepalive", self._run)
 
     def end(self) -> None:
-        """End the thread. It must not run in the native module while Python exits."""
+        """End the thread before Python exits, because then no thread may run in the native module."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
 
     def sessions(self) -> list[Session]:
-        """Return the sessions that were not deleted."""
+        """Return the sessions that `add` was called with and that Python has not deleted."""
         with self._lock:
             return list(self._sessions)
 
@@ -438,4 +446,4 @@ def _at_exit() -> None:
 
 os.register_at_fork(after_in_child=_native.note_fork)
 os.register_at_fork(after_in_child=_after_fork_in_child)
-atexit.register(_at_exit)  # runs before the private server is ended, whose handler was registered earlier
+atexit.register(_at_exit)  # runs before the handler of `local_server`, which was registered earlier, ends the servers

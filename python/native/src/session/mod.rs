@@ -61,7 +61,7 @@ pub struct Session {
     observation_size: usize,
     /// Id of the process that made the session.
     owner: u32,
-    /// Number of forks before the session was made.
+    /// The number of forks, [`FORKS`], when the session was made.
     forks: u32,
     closing: Arc<CloseSignal>,
     state: Mutex<SessionState>,
@@ -70,7 +70,7 @@ pub struct Session {
     snapshot_bytes: AtomicUsize,
 }
 
-/// The state of a batch after the last reply. It is a copy, because Python may change the arrays that it got.
+/// The observations and flags of a batch after the last reply. They are copies, because Python may change its arrays.
 #[derive(Default)]
 struct LastStep {
     /// The last observations, float32 `[N, O]`. They complete the observations of a request that resets or restores
@@ -188,7 +188,8 @@ impl Session {
             receipts,
             reward_terms,
             observe_parameters,
-            // For a single environment, messages are as cheap as arrays.
+            // Receipts of a batch come as arrays, which are cheaper than a message for each episode. For a single
+            // environment, messages are as cheap as arrays.
             receipt_arrays: receipts && !self.actions.single,
             groups: Vec::new(),
             lease: 0, // the session cannot be resumed after its connection is lost
@@ -203,9 +204,10 @@ impl Session {
         let unopened = BusyGuard(self);
         let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
         let opening = pin!(self.server.clone().open(request));
-        let come = runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
-        let (transport, opened) = come.map_err(RequestFailure::into_error)?;
-        // An older server ignores `observe_parameters`. The Python package then raises an error with a better message.
+        let outcome = runtime.wait(py, opening, self.deadline(), &self.closing).map_err(explain)?;
+        let (transport, opened) = outcome.map_err(RequestFailure::into_error)?;
+        // An older server ignores `observe_parameters`. Do not check the observations then, because the Python package
+        // raises an error with a better message.
         if opened.observes_parameters == observe_parameters {
             check_observations(&opened.observations, n, self.observation_size).map_err(|error| malformed(&error))?;
         }
@@ -328,7 +330,8 @@ impl Session {
         Ok((observations, Events::begun(&labels, done.started)?))
     }
 
-    /// Saves the environments that the mask selects, one snapshot each. Long snapshots come in several replies.
+    /// Saves the environments that the mask selects, one snapshot each. Snapshots that are too long for one reply are
+    /// requested in several requests.
     fn snapshot<'py>(&self, py: Python<'py>, mask: &[u8]) -> PyResult<Vec<Bound<'py, PyBytes>>> {
         let length = self.snapshot_bytes.load(Ordering::Relaxed);
         let selected = self.selected(mask);
@@ -347,8 +350,8 @@ impl Session {
     }
 
     /// Restores snapshots into the environments that the mask selects. Returns observations `[N, O]`. Other
-    /// environments have their last observations. Snapshots that are too long for one request are sent in several. If
-    /// one of these is refused, those before it were restored.
+    /// environments have their last observations. Snapshots that are too long for one request are sent in several
+    /// requests. If one of these requests is refused, the snapshots of the requests before it stay restored.
     fn restore<'py>(
         &self,
         py: Python<'py>,
@@ -364,7 +367,7 @@ impl Session {
                 format!("snapshots has {given} entries, expected {selected}: one for each selected environment");
             return Err(failure(INVALID, 0, words));
         }
-        // The server refuses a wrong number of snapshots in one message.
+        // Send a wrong number of snapshots in one request, so that the server refuses it with its own message.
         let all = 0..given;
         let parts = if given == selected { parts } else { vec![all] };
         for part in parts {
@@ -372,8 +375,8 @@ impl Session {
             let open = self.take(0)?;
             let request = proto::Restore { mask: mask.clone(), snapshots: snapshots[part].to_vec() };
             let (_, restored) = self.ask(py, open, request)?;
-            // Only the length is checked. Observations may not be finite, because the physics of a snapshot may have
-            // diverged.
+            // Check only the length of the observations. They may not be finite, because the physics of a snapshot may
+            // have diverged.
             arrays::numbers(&restored.observations, &[self.selected(&mask), self.observation_size])?;
             self.merge(&mask, &restored.observations);
         }
@@ -385,10 +388,10 @@ impl Session {
         let open = self.take(0)?;
         let (_, rendered) = self.ask(py, open, proto::Render { slot, width, height })?;
         let size = [height as usize, width as usize, 3];
-        let came = [rendered.height as usize, rendered.width as usize, 3];
-        if came != size || rendered.pixels.len() != size.iter().product::<usize>() {
+        let sent = [rendered.height as usize, rendered.width as usize, 3];
+        if sent != size || rendered.pixels.len() != size.iter().product::<usize>() {
             let bytes = rendered.pixels.len();
-            let words = format!("the server sent a picture {came:?} in {bytes} bytes; expected {size:?}");
+            let words = format!("the server sent a picture {sent:?} in {bytes} bytes; expected {size:?}");
             return Err(failure(MALFORMED, 0, words));
         }
         arrays::picture(py, &rendered.pixels, size)
@@ -400,7 +403,8 @@ impl Session {
         if std::process::id() != self.owner {
             return;
         }
-        // Python's lock is released first, because a thread that holds it may be waiting for the lock of the state.
+        // Release Python's lock before locking the state. Otherwise this thread could hold the lock of the state and
+        // wait for Python's lock, while another thread holds Python's lock and waits for the lock of the state.
         py.detach(|| {
             if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref()
                 && !open.transport.is_embedded()
@@ -453,20 +457,21 @@ impl Session {
         arrays::rows(py, &last.observations, self.actions.num_envs, self.observation_size)
     }
 
-    /// Returns the mask of a part of the n environments that `mask` selects, which the part counts from 0.
+    /// Returns a mask `[N]` for one of several requests. `mask` selects n environments, which are numbered from 0. The
+    /// request is for the numbers in `part`.
     fn part_mask(&self, mask: &[u8], part: &Range<usize>, n: usize) -> Bytes {
         if part.len() == n {
             return Bytes::copy_from_slice(mask);
         }
-        let mut place = 0..;
+        let mut numbers = 0..;
         let mut is_in_part = |slot| {
             let is_selected = mask.is_empty() || mask.get(slot).is_some_and(|&selected| selected != 0);
-            is_selected && place.next().is_some_and(|place| part.contains(&place))
+            is_selected && numbers.next().is_some_and(|number| part.contains(&number))
         };
         (0..self.actions.num_envs).map(|slot| u8::from(is_in_part(slot))).collect()
     }
 
-    /// Checks the reply to a step, and stores its observations and flags as the last ones.
+    /// Checks the reply to a step, and stores the reply's observations and flags in `last`.
     fn note(&self, stepped: &proto::Stepped) -> PyResult<()> {
         check_step(stepped, self.actions.num_envs, self.observation_size).map_err(|error| malformed(&error))?;
         *unpoisoned(&self.last) = LastStep {
@@ -502,6 +507,6 @@ pub fn catalogue(py: Python<'_>, address: &str, timeout: f64) -> PyResult<String
     let runtime = SessionRuntime::new().map_err(|error| failure(UNREACHABLE, 0, error.to_string()))?;
     let asking = pin!(async move { connect(&address, Timeouts::default()).await?.catalogue().await });
     let deadline = duration(timeout).and_then(|timeout| Instant::now().checked_add(timeout));
-    let come: Result<_, ClientError> = runtime.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
-    Ok(perturb_protocol::catalogue::to_json(&come.map_err(|error| failure::from_client(&error))?).to_string())
+    let outcome: Result<_, ClientError> = runtime.wait(py, asking, deadline, &Arc::default()).map_err(explain)?;
+    Ok(perturb_protocol::catalogue::to_json(&outcome.map_err(|error| failure::from_client(&error))?).to_string())
 }
