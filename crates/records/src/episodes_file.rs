@@ -1,8 +1,8 @@
-//! A file with the recorded episodes of all policies of a study. Each policy has a row group of its own.
+//! A file with the recorded episodes of all policies of a study. Each policy has its own row group.
 //!
 //! The file omits the applied parameters, because they follow from the requested parameters and the environment. It
-//! therefore takes a third of the space of the separate files that the trainings wrote. Each row still has the
-//! episode's address (seed and indices) and all its results.
+//! therefore takes a third of the space of the files that the trainings of the study wrote, one for each training. Each
+//! row still has the episode's address (seed and indices) and all its results.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -103,7 +103,7 @@ impl StudyEpisodes {
         let policy =
             |(cell, records): (&String, &Records)| EpisodesEntry { cell: cell.clone(), about: records.about.clone() };
         let about = StudyMetadata { policies: self.cells.iter().map(policy).collect() };
-        // The range of rows of each cell, which becomes a row group.
+        // Computes the range of rows of each cell. Each range becomes a row group.
         let mut groups = Vec::new();
         let mut end = 0;
         for records in self.cells.values() {
@@ -130,7 +130,7 @@ impl StudyEpisodes {
             ("achieved".into(), optional(|it| it.achieved)),
             ("also_achieved".into(), optional(|it| it.also_achieved)),
         ];
-        // A parameter's column has no value in rows of environments without this parameter.
+        // In rows of environments without this parameter, the parameter's column has no value.
         for name in self.parameters() {
             let value = |(_, records, it): (&String, &Records, &EpisodeRecord)| {
                 let place = records.about.parameters.iter().position(|parameter| parameter.name == name)?;

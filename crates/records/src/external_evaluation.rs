@@ -6,8 +6,8 @@
 //! DIR/episodes.parquet       the recorded tests of a policy; with several policies episodes-D.parquet and so on
 //! ```
 //!
-//! Every number in a report is computed from the records. The training of an agent is not known here, so the agent has
-//! no settings.
+//! Every number in a report is computed from the records. The records do not say how an agent was trained, so the
+//! agent has no settings.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
@@ -46,10 +46,10 @@ pub struct ExternalEvaluation {
     policies: Vec<ExternalPolicy>,
 }
 
-/// A policy of an external agent, with its recorded tests.
+/// A policy of an agent that was not trained by an experiment, with its recorded tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExternalPolicy {
-    /// Metadata of the policy that the records do not contain.
+    /// Metadata of the policy, apart from those in the records.
     pub known: PolicyMetadata,
     /// The recorded episodes of all its tests.
     pub records: Records,
@@ -57,7 +57,7 @@ pub struct ExternalPolicy {
     outcomes: PolicyOutcomes,
 }
 
-/// Metadata of an external policy that its records do not contain.
+/// Metadata of a policy that was not trained by an experiment. The policy's records do not contain these data.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyMetadata {
     /// The version (parameter distribution D, R, E or R+E) on which the policy was trained. `None` if unknown, or if the
@@ -93,7 +93,7 @@ struct PolicyEntry {
     known: PolicyMetadata,
 }
 
-/// A failure to read, write or combine the tests of an external agent.
+/// A failure to read, write or combine the tests of an agent that was not trained by an experiment.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
@@ -196,7 +196,7 @@ impl ExternalEvaluation {
         &self.policies
     }
 
-    /// Returns the method under which reports list the agent.
+    /// Returns the name and settings of a method, under which reports list the agent.
     pub fn method(&self) -> Method {
         Method {
             algorithm: self.agent.clone(),

@@ -11,7 +11,7 @@ use crate::axis::Axis;
 use crate::records::{EpisodeRecord, Records};
 use crate::statistics::mean;
 
-/// Maximal number of points along an axis. It is limited because the environments of all points run together.
+/// Maximum number of points along an axis. It is limited because the environments of all points run together.
 pub const MAX_POINTS: usize = 100;
 
 /// The options of a heatmap.
@@ -110,8 +110,8 @@ impl Heatmap {
     /// The name of the test set whose records make up a heatmap.
     pub const SET: &str = "heatmap";
 
-    /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, y the
-    /// other varying parameter. Returns `None` if `set` is not the test set of a heatmap.
+    /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, and y is
+    /// the other parameter that varies. Returns `None` if `set` is not the test set of a heatmap.
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
@@ -215,8 +215,8 @@ impl Heatmap {
         Some(Self { points: first.points.iter().enumerate().map(point).collect(), ..about(first) })
     }
 
-    /// Replaces the points by those in `csv`, which [`heatmap_table`] wrote. Returns `None` if they do not fit the axes
-    /// and the grid.
+    /// Replaces the points by the points in `csv`, a table as CSV that [`heatmap_table`] made. Returns `None` if the new
+    /// points do not fit the axes and the grid.
     pub fn with_points(self, csv: &[u8]) -> Option<Self> {
         let mut reader = csv::Reader::from_reader(csv);
         let rows: Result<Vec<[f64; 4]>, _> = reader.deserialize().collect();
@@ -232,11 +232,11 @@ impl Heatmap {
         let fits = |(index, point): (usize, &HeatmapPoint)| {
             (point.x, point.y) == (x.value(index % grid, grid), y.value(index / grid, grid))
         };
-        // A file of another origin may have no points, or a grid whose number of points overflows.
+        // A file that another program wrote may have no points, or a grid whose number of points overflows.
         grid > 0 && grid.checked_mul(grid) == Some(self.points.len()) && self.points.iter().enumerate().all(fits)
     }
 
-    /// Describes the values of the parameters that are not axes.
+    /// Describes in words the values of the parameters that are not axes.
     pub fn others(&self) -> String {
         let fixed: String = self.fixed.iter().map(|(name, value)| format!("{name} = {value}, ")).collect();
         match self.base {

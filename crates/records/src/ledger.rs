@@ -2,8 +2,8 @@
 //! environments, with their seeds and indices. The audit checks that the training drew from the claimed distribution,
 //! and that it never drew from the policy's test sets.
 //!
-//! The audit first finds the tokens under which the training's seed was drawn. The owners of these tokens may have
-//! learned from everything that these tokens drew, in any session, before the training ended.
+//! The audit first finds the training by its seed, and the access tokens of its sessions. The owners of these tokens may
+//! have learned from all parameters that were drawn with these tokens, in any session, before the training ended.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -22,7 +22,7 @@ use crate::records::{RecordedTest, Records};
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
-    /// The parameter draws of each environment.
+    /// The draws of parameters, by environment.
     drawn: Vec<Drawn>,
     /// The state of the environments with the same session, seed and environment index.
     at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
@@ -39,7 +39,7 @@ pub struct Ledgers {
 struct EnvironmentAddress {
     /// Indices in `drawn` of environments that are still in use.
     open: Vec<usize>,
-    /// Recorded ends that are not yet assigned to environments. They are assigned when there are as many ends as
+    /// Recorded ends of draws that are not yet assigned to environments. They are assigned when there are as many ends as
     /// environments in `open`.
     ends: Vec<(Option<u64>, Moment)>,
     /// Indices in `drawn` of the environments that ended last.
@@ -65,7 +65,7 @@ pub struct Head {
 /// The result of auditing one policy.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Proof {
-    /// The names of the tokens under which the training drew parameters. `None` stands for a session without a token.
+    /// The names of the access tokens with which the training drew parameters. `None` stands for a session without a token.
     /// Empty if no ledger contains the training.
     pub tokens: BTreeSet<Option<String>>,
     /// The number of sessions of the training.
@@ -199,8 +199,8 @@ impl Ledgers {
         }
     }
 
-    /// Stores a record of draws. Handles `ends` first, because the environments in `ends` stopped drawing before the
-    /// environments in `begins` started.
+    /// Stores a record of draws. Handles `ends` first, because the environments in `ends` stopped drawing parameters
+    /// before the environments in `begins` started.
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {
@@ -226,8 +226,8 @@ impl Ledgers {
         }
     }
 
-    /// Records that an environment stopped drawing. `end` has the environment's last episode and the time. The episode is
-    /// `None` if nothing was drawn.
+    /// Records that an environment stopped drawing parameters. `end` has the environment's last episode and the time.
+    /// The episode is `None` if nothing was drawn.
     fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.at.entry(address).or_default();
         address.ends.push(end);
@@ -294,7 +294,7 @@ impl Ledgers {
                 && proof.tokens.contains(&line.who.token)
                 && ends.iter().any(|end| end.is_none_or(|end| line.at.is_before(end)))
         };
-        // Looks for draws from the test sets with the training's tokens before the training ended.
+        // Finds draws from the test sets that were made with the training's tokens before the training ended.
         for test in &records.about.tests {
             let set = &test.set.name;
             let others = tested(environment, test, &claimed);

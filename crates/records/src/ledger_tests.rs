@@ -58,8 +58,8 @@ fn who(session: u64, token: &str) -> LedgerSession {
     LedgerSession { session, token: Some(token.into()), environment: "CartPole".into(), revision: 1 }
 }
 
-/// Returns the record of a session in which `count` environments, from `index` on, begin to draw from `version` at
-/// episode `episode`.
+/// Returns the record of a session in which `count` environments, from `index` on, begin to draw parameters from
+/// `version` at episode `episode`.
 fn begins(
     session: u64,
     token: &str,
@@ -71,8 +71,8 @@ fn begins(
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: vec![region], begins, ends: Vec::new() })
 }
 
-/// Returns the record of a session in which `count` environments, from `index` on, stop drawing. Their last episode was
-/// `episode`.
+/// Returns the record of a session in which `count` environments, from `index` on, stop drawing parameters. Their last
+/// episode was `episode`.
 fn ends(session: u64, token: &str, (seed, index, count, episode): (u64, u32, u32, u64)) -> LedgerEvent {
     let ends = vec![DrawEnd { seed, index, count, episode: Some(episode) }];
     LedgerEvent::Draws(DrawRecord { who: who(session, token), regions: Vec::new(), begins: Vec::new(), ends })
@@ -157,11 +157,11 @@ fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
     let reset = [begun.clone(), again.clone(), ends(1, "ann", (7, 0, 1, 0)), again, ended.clone()];
     let found = proof(&reset);
     assert_eq!(found.against.len(), 2, "{found:?}");
-    // Many short draws are not the same as one long draw of each environment.
+    // Nine times, two environments draw 5 episodes each: 90 episodes in total, although the episode numbers repeat.
     let short: Vec<LedgerEvent> =
         (0..9).flat_map(|_| [begins(0, "ann", R, (1, 0, 2, 0)), ends(0, "ann", (1, 0, 2, 4))]).collect();
     says(&proof(&short), "90 were drawn");
-    // An environment that is freed early does not end the draws of the others.
+    // One of the training's two environments is freed early. The training has not ended, because the other still draws.
     let early = [begun.clone(), ends(0, "ann", (1, 0, 1, 49)), begins(1, "ann", E, (9, 0, 1, 0))];
     says(&proof(&early), "of the test set E");
     // The server draws nothing for a refused request.

@@ -1,8 +1,8 @@
 //! Reading and writing of Parquet files: named columns, and a JSON document in the file's metadata.
 //!
 //! Parquet was chosen because pandas, polars, DuckDB and R can read it without perturb. It has types, including 64-bit
-//! integers, and takes about half the space of CSV. Its Rust implementation is Apache's own. Equal columns give equal
-//! bytes.
+//! integers, and takes about half the space of CSV. The Rust implementation that is used here is Apache's own. Equal
+//! columns give equal bytes.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -53,7 +53,7 @@ pub enum ColumnValues<'a> {
 pub(crate) type NamedColumn<'a> = (String, ColumnValues<'a>);
 
 impl ColumnValues<'_> {
-    /// Returns the column's type in Parquet's schema language, as the texts before and after the column's name.
+    /// Returns the column's type in Parquet's schema language: the texts before and after the column's name.
     fn kind(&self) -> (&'static str, &'static str) {
         match self {
             Self::Text(_) => ("required binary", " (STRING)"),
@@ -246,8 +246,8 @@ impl ParquetFile {
     }
 }
 
-/// A row group: some of the rows of a file. It is read by column, because reading by row takes four times as long, and
-/// reports read millions of rows.
+/// A row group: a range of a file's rows. It is read column by column. Reading row by row would take four times as
+/// long, and reports read millions of rows.
 pub(crate) struct RowGroup<'a> {
     group: Box<dyn RowGroupReader + 'a>,
 }

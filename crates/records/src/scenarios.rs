@@ -21,8 +21,8 @@ pub enum TrainedOn<'a> {
     Version(Version),
     /// A parameter set of the experiment file, by its name.
     Set(&'a str),
-    /// An unknown distribution, or one that is neither a version nor a set. Only policies that were not trained by the
-    /// experiment have it.
+    /// An unknown distribution, or one that is neither a version nor a set. It occurs only for policies that were not
+    /// trained by the experiment.
     Unknown,
 }
 

@@ -1,4 +1,4 @@
-//! Choice and recording of a test's episodes. The same policy gives the same records with any program that plays it.
+//! Choice and recording of a test's episodes. A policy's records do not depend on the program that plays the policy.
 
 use perturb_policy::random::{Purpose, stream};
 use perturb_protocol::region::{self, Region};
@@ -9,7 +9,7 @@ use rand::Rng;
 use crate::heatmap::Heatmap;
 use crate::records::{Difference, EpisodeRecord, RecordedTest, Records};
 
-/// Maximal number of environments in a test, unless the test set has more contexts.
+/// Maximum number of environments in a test, unless the test set has more contexts. Each context has an environment.
 const MAX_ENVS: usize = 100;
 
 /// The reason why a test's episodes cannot be recorded.
@@ -41,7 +41,7 @@ pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
     drawn[version as usize]
 }
 
-/// Returns for each environment `[N]` the number of its trials that count. Environment i has context i modulo
+/// Returns for each of the N environments the number of its trials that count. Environment i has context i modulo
 /// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes` episodes.
 /// `contexts` must be at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
@@ -53,7 +53,8 @@ fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
 }
 
 /// Collects the episodes of a running test. The number of trials that count is fixed in advance for each environment,
-/// because taking the first episodes to end would favour short episodes. Only the last episode of each trial counts.
+/// because taking the first episodes to end would favour short episodes. A trial is one episode, or with RL² several,
+/// of which only the last counts.
 #[derive(Clone, Debug)]
 pub struct TestCollector {
     test: RecordedTest,
@@ -94,7 +95,7 @@ impl TestCollector {
 
     /// Returns the number of episodes collected so far, and the number of episodes to collect.
     pub fn progress(&self) -> (u64, u64) {
-        // The sum saturates. An overflow would end a test of very many episodes before its first episode.
+        // The sum saturates, because an overflow would give a small number. The test would then end too early.
         (self.counted.len() as u64, self.quotas.iter().fold(0, |sum, &quota| sum.saturating_add(quota)))
     }
 

@@ -52,7 +52,7 @@ pub struct ConditionMean {
     /// The 95 % t interval of the mean over policies, [low, high]. It supports conclusions about other seeds. `None`
     /// with fewer than three policies.
     pub seeds_95: Option<[f64; 2]>,
-    /// Number of episodes that each policy played; the smallest number if they differ.
+    /// Number of episodes that each policy played; the smallest number if the numbers differ.
     pub episodes: usize,
     /// The 95 % interval of the mean over episodes, [low, high]. It supports conclusions about the same policies in
     /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval with an
@@ -190,9 +190,9 @@ impl TestedCondition<'_> {
         self.policies.iter().map(|policy| policy.mean).collect()
     }
 
-    /// Returns the scores in independent groups. If all policies played the same episodes, there is one group: the mean
-    /// score over policies for each episode. Otherwise each policy's scores are a group. Returns `None` if only the means
-    /// of policies are known.
+    /// Returns the scores of episodes in independent groups. If all policies played the same episodes, there is one
+    /// group: the mean score over policies for each episode. Otherwise each policy's scores are a group. Returns `None`
+    /// if only the means of policies are known.
     fn strata(&self) -> Option<Vec<Vec<f64>>> {
         if self.policies.iter().any(|policy| policy.values.is_empty()) {
             return None;

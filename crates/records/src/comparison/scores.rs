@@ -38,8 +38,9 @@ impl TestScores {
         }
     }
 
-    /// Returns the scores of a row of a results table. A row has the number of successes, so their scores are listed. Of
-    /// returns and lengths it has only the mean. Returns `None` for a failed cell.
+    /// Returns the scores of a row of a results table. From the row's number of successes, the score of each episode
+    /// follows, except for the order of the episodes. Of returns and lengths, a row has only the means. Returns `None`
+    /// for a failed cell.
     pub(super) fn of_row(row: &TableRow, score: ComparedScore) -> Option<Self> {
         let result = row.result()?;
         let (episodes, successes) = (usize::try_from(row.episodes?).ok()?, usize::try_from(row.successes?).ok()?);
@@ -55,7 +56,7 @@ impl TestScores {
     }
 }
 
-/// Returns whether all policies are known to have played the same episodes.
+/// Returns whether all policies are known to have played the same episodes. Returns false if their addresses are unknown.
 pub(super) fn share_episodes(policies: &[TestScores]) -> bool {
     policies.windows(2).all(|two| !two[0].addresses.is_empty() && two[0].addresses == two[1].addresses)
 }

@@ -67,7 +67,8 @@ pub fn compare_rows(
     Ok(ConditionComparison { from_counts: true, ..compared(&sets, score, baseline, tested) })
 }
 
-/// Returns a condition's tests of final policies. If a cell was tested several times on a set, takes its last test.
+/// Returns a condition's tests of policies at the end of their training. If a cell was tested several times on a set during
+/// its training, takes the last test.
 fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
     let mut places: BTreeMap<(&str, &str, &str), usize> = BTreeMap::new();
     let mut found: Vec<RowTest<'a>> = Vec::new();
@@ -77,8 +78,8 @@ fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
         match found.get_mut(place) {
             Some(test) if row.after_episodes > test.row.after_episodes => *test = RowTest { set, row },
             Some(test) if row.after_episodes < test.row.after_episodes => {}
-            // Two rows for the same test, for example from two tables, are both taken. `one_policy_for_each_seed` refuses
-            // them.
+            // If two rows are of the same test, for example from two tables, both are added. `one_policy_for_each_seed`
+            // then returns an error.
             _ => found.push(RowTest { set, row }),
         }
     }

@@ -3,7 +3,7 @@
 use super::{ComparedScore, ConditionDifference};
 use crate::statistics::MIN_RUNS_FOR_INTERVAL;
 
-/// A difference is called decided if its corrected p-value is below this limit.
+/// A difference is called decided (statistically significant) if its corrected p-value is below this limit.
 const MAX_DECIDED_P: f64 = 0.05;
 
 impl ConditionDifference {
@@ -14,7 +14,7 @@ impl ConditionDifference {
     }
 }
 
-/// Describes one difference. `compared` is the number of differences of the comparison that have a p-value.
+/// Describes one difference in words. `compared` is the number of differences in the whole comparison that have a p-value.
 pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, compared: usize) -> String {
     let (Some(interval), Some(p), Some(corrected)) = (it.seeds_95, it.p, it.p_holm) else {
         return format!("{}: {}", few_seeds_numbers(it, score), few_seeds(it));

@@ -65,9 +65,9 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     Some(50.0 * (one_way(0) + one_way(1)))
 }
 
-/// Returns the success rate, 0 … 1, in the worst tenth of the regions `parts`. Half number `chooses` of the episodes, 0
-/// or 1, determines which regions are worst; the returned rate is measured in the other half. `parts` must be sorted by
-/// the success rate in half number `chooses`.
+/// Returns the success rate, 0 … 1, in the worst tenth of the regions `parts`. The episodes of half `chooses`, 0 or 1,
+/// determine which regions are worst. The returned rate is measured in the other half. `parts` must be sorted by the
+/// success rate in half `chooses`.
 fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();
@@ -112,7 +112,7 @@ mod tests {
     fn the_worst_contexts_are_found_and_parts_of_them_count_in_part() {
         // Two of 20 contexts always fail. They are the worst tenth.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3 && context != 17)), Some(0.0));
-        // One context always fails, and is half of the worst tenth. The other half are contexts that always succeed.
+        // One of 20 contexts always fails. The worst tenth is two contexts, so the other one of them always succeeds.
         assert_eq!(worst_contexts(&outcomes(20, 10, |context, _| context != 3)), Some(50.0));
         // Context c succeeds in its first c + 1 episodes. In episodes 0, 2, … contexts 0 and 1 are equally bad. In the
         // other episodes they have 0 and 1 successes of 5. In episodes 1, 3, … context 0 is the worst. In the other

@@ -47,7 +47,7 @@ pub struct RecordsMetadata {
     pub applied: Vec<String>,
     /// The id of the checkpoint that was tested.
     pub policy: String,
-    /// The number of episodes in a trial, of which only the last one is recorded. 1 if the policy has no trials.
+    /// The number of episodes in a trial of RL². Only the last episode of each trial is recorded. 1 for other policies.
     pub episodes_per_trial: u32,
     /// The success criterion; `None` if the server determined success without stating its criterion.
     pub success: Option<Criterion>,
@@ -255,7 +255,7 @@ impl Records {
         self.episodes.extend(episodes);
     }
 
-    /// Adds the tests of `other`, which must be of the same policy.
+    /// Adds the tests and episodes of `other`, which must be of the same policy.
     pub fn append(&mut self, other: Self) {
         self.about.tests.extend(other.about.tests);
         self.episodes.extend(other.episodes);
@@ -267,7 +267,7 @@ impl Records {
     }
 
     /// Computes the results of the test on the set called `name`. With `criterion`, determines success by this
-    /// criterion instead of the recorded one; its quantity must have been recorded.
+    /// criterion instead of the recorded one. The quantity of `criterion` must have been recorded.
     pub fn result(&self, name: &str, criterion: Option<&Criterion>) -> TestResult {
         let success =
             |episode: &EpisodeRecord| criterion.map_or(episode.success, |c| c.holds(self.achieved(episode, c)));

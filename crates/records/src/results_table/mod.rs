@@ -39,7 +39,7 @@ pub struct ResultsTable {
 pub struct StudyPlan {
     /// The text of the experiment file.
     pub plan: String,
-    /// The contents of the other files that the experiment file refers to, by file name.
+    /// The contents of the other files to which the experiment file refers, by file name.
     #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
     pub beside: BTreeMap<String, String>,
 }
@@ -63,7 +63,7 @@ pub struct TableRow {
     pub algorithm: String,
     /// The policy's architecture: "ff" (feed-forward) or "rc" (recurrent).
     pub architecture: String,
-    /// The preset, which chooses the default settings.
+    /// The preset: the name of the set of default settings.
     pub preset: String,
     /// The quantities that the policy observes: "state" or "parameters".
     pub observe: String,
@@ -71,7 +71,7 @@ pub struct TableRow {
     pub trained_on: String,
     /// The name of the parameter set or version of the test. `None` for a failure.
     pub tested_on: Option<String>,
-    /// The number of the run, i.e. of the repetition of the study, from 1.
+    /// The number of the run, from 1. A study is run several times, with a different seed in each run.
     pub run: u32,
     /// The seed of the training and of the test.
     pub seed: u64,
@@ -202,7 +202,7 @@ impl ResultsTable {
         &self.rows
     }
 
-    /// Returns the rows of a study, by the id of the cell.
+    /// Returns the rows of a study, grouped by the id of their cell.
     pub fn of_study(&self, study: &str) -> HashMap<&str, Vec<&TableRow>> {
         let mut cells: HashMap<&str, Vec<&TableRow>> = HashMap::new();
         for row in self.rows.iter().filter(|row| row.study == study) {
@@ -211,8 +211,8 @@ impl ResultsTable {
         cells
     }
 
-    /// Adds `rows` of a study's cells to the table. They replace earlier rows of the same cells. If a new row lacks a
-    /// value because a file was deleted, the earlier value is kept.
+    /// Adds `rows` of a study's cells to the table. The new rows replace earlier rows of the same cells. If a new row
+    /// lacks a value because a file was deleted, the earlier value is kept.
     pub fn merge(&mut self, study: &str, plan: StudyPlan, rows: Vec<TableRow>) -> MergeCounts {
         self.studies.insert(study.to_owned(), plan);
         let mut counts = MergeCounts::default();

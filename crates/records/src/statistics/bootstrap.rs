@@ -12,7 +12,7 @@ pub struct Bootstrapped {
     pub point: f64,
     /// The 95 % interval, [low, high]. `None` with fewer than [`MIN_RUNS_FOR_INTERVAL`] runs.
     pub interval_95: Option<[f64; 2]>,
-    /// Number of runs in each environment; the smallest number if they differ.
+    /// Number of runs in each environment; the smallest number if the numbers differ.
     pub runs: usize,
 }
 
@@ -38,9 +38,9 @@ impl Bootstrapped {
     }
 }
 
-/// Computes the numbers that `statistic` returns for `strata`, each with its percentile interval over `resamples`
-/// resamples. The statistic must always return the same number of values. Returns `None` if there are no strata, or if
-/// a stratum has no runs.
+/// Computes the numbers that `statistic` returns for `strata`, each with its percentile interval. The interval is computed
+/// from `resamples` resamples. The statistic must always return the same number of values. Returns `None` if there are no
+/// strata, or if a stratum has no runs.
 pub fn bootstrap(
     strata: &[Vec<f64>],
     resamples: usize,
