@@ -1,5 +1,5 @@
-//! A canvas that draws texts, lines and areas. All positions and lengths are in units; a PNG has several pixels per
-//! unit.
+//! A canvas that draws texts, lines and areas. All positions and lengths are in units. A unit is a CSS pixel in an SVG, and
+//! several pixels in a PNG.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;

@@ -61,7 +61,7 @@ impl Frame {
     }
 
     /// Returns the values of the x ticks, with their numbers as text. If the frame is too narrow for all numbers, only
-    /// the first and the last tick, or only the last tick, have one.
+    /// the first and the last tick, or only the last tick, have a number.
     fn x_ticks(&self) -> Vec<(f64, Option<String>)> {
         let sets: Vec<_> = (2..=MAX_TICKS).rev().map(|most| round_ticks(&self.x, most)).collect();
         // A single tick would not show the scale of the axis.
@@ -109,7 +109,7 @@ pub(super) fn y_numbers_width(y: &Range<f64>, height: f64) -> f64 {
     frame.y_ticks().iter().map(|(_, number)| text_width(number)).fold(0.0, f64::max) + 6.0
 }
 
-/// Returns the relative position of a value in a range (0 to 1).
+/// Returns the relative position of a value in a range: 0 at its start, 1 at its end. Returns 0.5 for an empty range.
 fn share(range: &Range<f64>, value: f64) -> f64 {
     let span = range.end - range.start;
     if span > 0.0 { (value - range.start) / span } else { 0.5 }
@@ -163,7 +163,7 @@ mod tests {
 
     use super::*;
 
-    /// The range is MountainCar's force. The widths are from rows of one, three and four panels.
+    /// The x range is that of MountainCar's force. The widths are those of a panel in rows of one, three and four panels.
     #[rstest]
     #[case(210.0, &["0.005", "0.010"])]
     #[case(85.0, &["0.002", "", "", "", "0.010"])]

@@ -1,6 +1,6 @@
 //! Draws heatmaps of several policies side by side. The upper panels show the mean return over two parameters, the
-//! lower panels the success rate. Each panel also shows the ranges of R and E as boxes, and the default parameters as a
-//! ring. All panels share their axes. Panels of the same quantity share a colour scale.
+//! lower panels the success rate. Each panel also shows the ranges of the versions R (random) and E (extreme) as boxes,
+//! and the default parameters as a ring. All panels share their axes. Panels of the same quantity share a colour scale.
 
 mod scale;
 mod surfaces;
@@ -30,9 +30,10 @@ const HEIGHTS: Range<f64> = 96.0..150.0;
 const GAP: f64 = 9.0;
 /// Height of the colour scale, in units.
 const BAR: f64 = 10.0;
-/// The outline of R's box: a white line on a wider black line, so that it is visible on every colour.
+/// The outline of the box that shows the range of version R. It is a white line on a wider black line, so that it is
+/// visible on every colour.
 const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
-/// The outline of E's boxes: a red line on a wider white line.
+/// The outline of the boxes that show the ranges of version E: a red line on a wider white line.
 const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
 /// Minimum distance of a box from the edges of its panel, in units.
 const WITHIN: f64 = 2.0;
@@ -146,7 +147,7 @@ impl HeatmapPanels {
         if self.columns.len() > MAX_COLUMNS { FEWER } else { self.columns.len().max(1) }
     }
 
-    /// Returns the columns by row of the picture.
+    /// Returns the picture's columns, divided into the picture's rows.
     fn rows(&self) -> std::slice::Chunks<'_, HeatmapColumn> {
         self.columns.chunks(self.per_row())
     }
@@ -175,7 +176,7 @@ impl HeatmapPanels {
         columns * self.size().0 + (columns - 1.0) * GAP
     }
 
-    /// Returns the lines of each caption of a row.
+    /// Returns each caption of a row, broken into lines.
     fn caption_lines(&self, row: &[HeatmapColumn]) -> Vec<Vec<String>> {
         row.iter().map(|of| wrapped(&of.caption, self.size().0)).collect()
     }
@@ -253,8 +254,8 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
             (self.at((frame.left, frame.top)), self.at((frame.right(), frame.bottom())));
         let (width, height, grid) = (right - left, bottom - top, heatmap.grid as i32);
         let edge = |length: i32, index: usize| length * index as i32 / grid;
-        // Renderers that smooth edges let the background shine through between rectangles, so the background gets the
-        // mean colour.
+        // First draws a background in the mean colour. Some renderers smooth edges, so that the background is visible
+        // between rectangles.
         let (low, high) = (quantity.range.start, quantity.range.end);
         let shares =
             heatmap.points.iter().map(|point| (((quantity.value)(point) - low) / (high - low)).clamp(0.0, 1.0));

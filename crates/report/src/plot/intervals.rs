@@ -31,8 +31,8 @@ pub struct IntervalPlot {
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) groups: Vec<Group>,
-    /// The texts of the legend: what the number of a row is, what its interval is, and what the row's second number is
-    /// (see [`IntervalRow::other`]). The text for a symbol that no row has may be empty.
+    /// The texts of the legend. They explain a row's number, its interval and its second number (see
+    /// [`IntervalRow::other`]). A text may be empty if no row has this symbol.
     pub(crate) legend: [String; 3],
     /// The note below all groups.
     pub(crate) note: String,

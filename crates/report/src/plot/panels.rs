@@ -25,7 +25,7 @@ const DOT: f64 = 3.0;
 pub(crate) const RATES: Range<f64> = -2.0..102.0;
 
 /// A picture of line charts below each other, with a common legend. If successive panels have the same x axis, only the
-/// lowest of them shows its numbers.
+/// lowest of these panels shows the axis' numbers.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Panels {
     /// The title above all panels.
@@ -107,8 +107,8 @@ impl Panels {
         wrapped(&self.note, INSIDE)
     }
 
-    /// Returns whether the panel shows the numbers and the name of its x axis. The last panel does, and every panel
-    /// whose successor has a different x axis.
+    /// Returns whether the panel shows the numbers and the name of its x axis. This is true for the last panel, and
+    /// for every panel whose successor has a different x axis.
     fn has_x_axis(&self, index: usize) -> bool {
         let axis = |panel: &PlotPanel| (panel.x_name.clone(), panel.x.clone());
         self.panels.get(index + 1).is_none_or(|next| axis(next) != axis(&self.panels[index]))

@@ -27,14 +27,15 @@ pub struct EnvironmentComparison {
 }
 
 /// Compares the success rates of agents that were trained outside of the experiment, in each environment with at least
-/// two such agents. Only tests that all of them have are compared. An agent's policies with the same training
+/// two such agents. Only tests that all of these agents have are compared. An agent's policies with the same training
 /// distribution count as its seeds.
 pub(super) fn comparisons_of(assessed: &[ExternalEvaluation]) -> Vec<EnvironmentComparison> {
     let environments = distinct(assessed.iter().map(ExternalEvaluation::environment));
     environments.into_iter().filter_map(|environment| comparison_in(environment, assessed)).collect()
 }
 
-/// Compares the agents in one environment. Returns `None` if there are fewer than two, or they cannot be compared.
+/// Compares the agents in one environment. Returns `None` if there are fewer than two agents, or if they cannot be
+/// compared.
 fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<EnvironmentComparison> {
     let here = assessed.iter().filter(|one| one.environment() == environment);
     let policies: Vec<(&str, &ExternalPolicy)> =

@@ -26,8 +26,8 @@ impl<'a> Report<'a> {
         rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
     }
 
-    /// Returns a picture for each environment, if the first picture of the page is of the average. Otherwise returns an
-    /// empty list, because the page begins with these pictures.
+    /// Returns a picture for each environment if the page begins with a picture of the average. Otherwise the page already
+    /// begins with a picture of each environment, so returns an empty list.
     pub(super) fn environment_pictures(&self) -> Vec<Picture> {
         if !self.has_average() {
             return Vec::new();
@@ -50,7 +50,7 @@ impl<'a> Report<'a> {
         self.metrics.chunk_by(|a, b| a.environment == b.environment)
     }
 
-    /// Returns the name of the environment of `rows`, or "Average over …".
+    /// Returns the name of the environment of `rows`, or "Average over …" if `rows` are averages over environments.
     fn finding_of(&self, rows: &[MethodMetrics<'_>]) -> String {
         if rows[0].environment != AVERAGE {
             return rows[0].environment.to_owned();
@@ -187,7 +187,7 @@ fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) 
     format!(" Extrapolation is a geometric mean, and 0 in a run where one of its three is: {}.", methods.join(", "))
 }
 
-/// Formats a mean with its interval, e.g. "8.0 % [6.5, 9.0]". A mean of one run is marked.
+/// Formats a mean with its interval, e.g. "8.0 % [6.5, 9.0]". Adds "(1 run)" to the mean of a single run.
 fn shown(mean: Bootstrapped) -> String {
     match mean.interval_95 {
         Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
@@ -201,7 +201,7 @@ fn rounded(points: f64) -> f64 {
     (10.0 * points).round() / 10.0 + 0.0
 }
 
-/// Returns a sentence that says which numbers have no interval, and why. Returns `None` if all numbers have one.
+/// Returns a sentence that says which numbers have no interval, and why. Returns `None` if all numbers have an interval.
 fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let all: Vec<&Bootstrapped> = rows.iter().flat_map(|row| row.means.values()).collect();
     let without: Vec<_> = all.iter().filter(|mean| mean.interval_95.is_none()).collect();

@@ -19,8 +19,8 @@ use super::pictures::{Picture, PictureDrawing, file_name};
 use crate::heatmap_policies::points_table;
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 
-/// The pictures of all heatmaps of a report. There is one for each environment, pair of parameters and method. It has a
-/// column for each training distribution, which shows the mean over runs.
+/// The pictures of all heatmaps of a report. There is a picture for each environment, pair of parameters and method.
+/// A picture has a column for each training distribution, which shows the mean over runs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatmapPictures {
     /// The pictures that have at least one heatmap.
@@ -201,7 +201,8 @@ impl<'a> Draft<'a> {
         })
     }
 
-    /// Returns the caption: what the picture shows, its runs, its test seeds and programs.
+    /// Returns the caption. It names the subject, the runs, the seeds of the tests, and the programs that made the
+    /// heatmaps.
     fn caption(&self, of: &str, tested: &str) -> String {
         let origins = || self.columns.iter().flat_map(|column| &column.origins);
         let seeds: BTreeSet<u64> = origins().map(|origin| origin.seed).collect();

@@ -47,7 +47,7 @@ fn is_of(cell: &Cell, environment: &str, algorithm: &str) -> bool {
 }
 
 /// Returns a heatmap with higher success rates near the default. The region of success is larger for wider training
-/// distributions. The second run is 40 points worse.
+/// distributions. The success rate of the second run is 40 percentage points lower.
 fn trained(cell: &Cell) -> Heatmap {
     let of_run = 20.0 * f64::from(cell.run * 2 - 1);
     let reach = [0.3, 0.5, 0.9][cell.config.common.version as usize];

@@ -1,4 +1,4 @@
-//! Computes the metrics of a report, and pairs them with the paper's.
+//! Computes the metrics of a report, and pairs them with the paper's numbers.
 
 use std::collections::{BTreeMap, BTreeSet};
 
@@ -38,9 +38,9 @@ pub(super) struct MethodMetrics<'a> {
     /// Scenarios with a success rate of 0 that make Extrapolation 0 in some run, although another of its three
     /// scenarios has successes.
     pub(super) zeros: BTreeSet<Scenario>,
-    /// Interquartile means; only in the average over environments.
+    /// Interquartile means. Empty unless this is an average over environments.
     pub(super) iqms: BTreeMap<Metric, Bootstrapped>,
-    /// Optimality gaps; only in the average over environments.
+    /// Optimality gaps. Empty unless this is an average over environments.
     pub(super) gaps: BTreeMap<Metric, Bootstrapped>,
     /// Interquartile means and optimality gaps, with intervals from a bootstrap that repeats every selection in each
     /// resample.
@@ -129,7 +129,8 @@ pub(super) fn averages<'a>(
     methods.cloned().map(of_method).collect()
 }
 
-/// Counts successes and episodes of a test over all runs and tied configurations.
+/// Counts the successes and the episodes of a test, over all runs and over all tied configurations. Configurations are
+/// tied if they have the same result in the selection.
 pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, tested_on: &str) -> Counted {
     let trained = selection.runs.values().flat_map(|run| run.tied_on(trained_on));
     let tests = trained.filter_map(|selected| selected.test(tested_on));
@@ -150,8 +151,8 @@ fn known<T>(of: impl Fn(Metric) -> Option<T>) -> BTreeMap<Metric, T> {
     Metric::ALL.into_iter().filter_map(|metric| Some((metric, of(metric)?))).collect()
 }
 
-/// Returns the mean of a metric over environments and over the runs that all of them have, %. Clamps its t interval to
-/// 0 … 100 %.
+/// Returns the mean of a metric over environments, and over the runs that all these environments have, %. Clamps its t
+/// interval to 0 … 100 %.
 fn mean_with_interval(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Bootstrapped> {
     let mean = mean_with_t_interval(&scores(selections, metric))?;
     let interval_95 = mean.interval_95.map(|interval| interval.map(|end| end.clamp(0.0, MAX_SUCCESS)));

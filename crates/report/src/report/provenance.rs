@@ -110,7 +110,7 @@ fn seeds<'a>(cells: impl Iterator<Item = &'a Cell>) -> String {
     }
 }
 
-/// Returns the number that all cells have in common, or the range of the numbers, e.g. "5 to 9".
+/// Returns the number that `of` returns for all cells, or the range of these numbers, e.g. "5 to 9".
 fn range(cells: &[Cell], of: fn(&Cell) -> u64) -> String {
     let numbers: BTreeSet<u64> = cells.iter().map(of).collect();
     match (numbers.first(), numbers.last()) {

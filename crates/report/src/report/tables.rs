@@ -116,7 +116,7 @@ impl Report<'_> {
         self.scope.tested_on.iter().copied().filter(is_there).map(|name| (row, train, name)).collect()
     }
 
-    /// Formats a number of runs. Adds the plan's number if it is higher.
+    /// Formats a number of runs. If the plan has more runs, adds their number, e.g. "2 of 5".
     fn runs(&self, method: &Method, runs: usize) -> String {
         let all = self.plan.runs;
         if method.external || runs == all as usize { runs.to_string() } else { format!("{runs} of {all}") }
