@@ -55,7 +55,7 @@ impl LiveAssessment {
         hasher.finish()
     }
 
-    /// Returns the folder for the report, or the reason why none can be built.
+    /// Returns the folder from which the report is built, or the reason why no report can be built.
     pub(crate) fn report_folder(&self) -> Result<PathBuf, String> {
         self.status().map_err(|reason| format!("this assessment is not understood: {reason}"))?;
         Ok(self.path.clone())

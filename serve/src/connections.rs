@@ -133,7 +133,7 @@ pub(crate) async fn serve(mut listener: TcpListener, router: Router, limits: Con
     }
 }
 
-/// A response body that holds the guard of its request until it was sent or dropped.
+/// A response body. It holds the guard of its request until the body was sent or dropped.
 struct GuardedBody {
     body: Body,
     _guard: RequestGuard,
@@ -176,7 +176,7 @@ mod tests {
         write_timeout: Duration::from_millis(500),
     };
     const REQUEST: &[u8] = b"GET / HTTP/1.1\r\nHost: a\r\n\r\n";
-    /// Upper bound of every wait; the machine may be busy.
+    /// Maximum time for which a test waits for something. It is long, because the machine may be busy.
     const DEADLINE: Duration = Duration::from_secs(30);
 
     /// Serves a short page at `/`, one that takes longer than the head's timeout at `/slow`, and a large one at

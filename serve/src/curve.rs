@@ -64,7 +64,7 @@ pub(crate) struct LearningCurve {
     pub(crate) length: Vec<f64>,
     /// Steps per second; `None` if it is not known yet.
     pub(crate) speed: Vec<Option<f64>>,
-    /// Number of episodes of each point. The last point may have more or fewer.
+    /// Number of episodes of each point. The last point may have a different number.
     #[serde(rename = "each")]
     pub(crate) episodes_per_point: usize,
 }
@@ -184,7 +184,8 @@ impl EpisodeLog {
         let groups_per_point = self.groups.len().div_ceil(points).max(1);
         let mut parts: Vec<EpisodeGroup> = self.groups.chunks(groups_per_point).map(EpisodeGroup::sum).collect();
         let episodes_per_point = groups_per_point * self.group_size;
-        // If the last point has few episodes, it is merged with the point before it, because its mean is unreliable.
+        // If the last point has few episodes, it is merged with the point before it, because the mean of few episodes
+        // is unreliable.
         if let [.., before, last] = &mut parts[..]
             && last.episodes < episodes_per_point / 2
         {

@@ -23,7 +23,7 @@ const TEST_SHARE: f64 = 0.25;
 /// Time for which the experiment still counts as running after its last running cell was seen. It covers the time
 /// between the end of a cell and the start of the next one.
 const BETWEEN_CELLS: Duration = Duration::from_secs(15);
-/// Pause before a damaged experiment is read again, as a multiple of the time that the last reading took.
+/// Pause before an experiment that could not be read is read again, as a multiple of the time that the last attempt took.
 const REREAD_FACTOR: u32 = 20;
 
 /// The state of an experiment at the last refresh.
@@ -296,7 +296,7 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.durations();
     let cells = &status.plan.cells;
     let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
-    // The measured seconds per episode of each cell. Cells of kinds without a measured duration are left out.
+    // The measured seconds per episode of each cell, without cells whose kind has no measured duration yet.
     let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
     let mean = if measured.is_empty() { 1.0 } else { perturb_records::statistics::mean(measured.iter().copied()) };

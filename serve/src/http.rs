@@ -165,7 +165,7 @@ async fn curves(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     page(&pages::curves::page(&state.root, &chosen), &WayUp::from_index())
 }
 
-/// Streams the events of the list of all runs, or of the curves of the trainings that the query names.
+/// Streams the events of the list of all runs. If the query names trainings, streams the events of their curves instead.
 async fn index_events(
     State(state): State<Arc<AppState>>,
     Extension(peer): Extension<ClientAddress>,
@@ -194,7 +194,7 @@ fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) ->
     let Some(place) = state.stream_places.take(peer) else {
         let message = "Too many pages are open already; close some.";
         let mut response = pages::message_page(StatusCode::SERVICE_UNAVAILABLE, message);
-        // Closing the connection prevents clients that retry from occupying connections.
+        // Closes the connection, so that a client that repeats its request does not occupy a connection meanwhile.
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
         return response;
     };
@@ -249,7 +249,7 @@ fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
     RelativePath::decode(uri.path().strip_prefix(prefix)?)
 }
 
-/// Returns the trainings that a query names, as in `runs=a,b/c`; at most as many as are drawn.
+/// Returns the trainings that a query names, as in `runs=a,b/c`. Returns at most [`pages::curves::MAX_TRAININGS`] of them.
 fn chosen_trainings(uri: &Uri) -> Option<Vec<RelativePath>> {
     let names = uri.query()?.strip_prefix("runs=")?;
     names.split(',').take(pages::curves::MAX_TRAININGS).map(RelativePath::decode).collect()

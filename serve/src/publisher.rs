@@ -51,7 +51,7 @@ pub(crate) type EventData = Arc<str>;
 #[derive(Debug)]
 pub(crate) struct View {
     pub(crate) update: Update,
-    /// `update` as the data of an event.
+    /// The data of the event that sends `update` to browsers.
     event: EventData,
 }
 
@@ -230,8 +230,8 @@ impl Publisher {
 
     /// Loads the pages of `topics`, and sends events to their subscribers.
     async fn publish(self: &Arc<Self>, topics: Vec<Topic>) {
-        // A page that is still being loaded is skipped, so that it does not delay others. A page without an event is
-        // never skipped, so that its subscribers get at least an error.
+        // A page that is still being loaded is skipped, so that it does not delay others. A page that has not sent an
+        // event yet is never skipped, so that its subscribers get at least an error.
         let is_due = |topic: &Topic| {
             let has_event = self.topics().get(topic).is_some_and(|sender| !sender.borrow().is_empty());
             !(has_event && self.loader(topic).is_loading())

@@ -16,7 +16,7 @@ const MAX_REPORTS: usize = 16;
 /// Maximum number of requests that wait for reports at the same time. Further requests are refused, and browsers repeat
 /// them.
 const MAX_WAITING: usize = 32;
-/// Pause between two builds of any reports, as a multiple of the last build's duration.
+/// Pause between two builds, also of different reports, as a multiple of the last build's duration.
 const BUILD_PAUSE_FACTOR: u32 = 2;
 /// Minimum time between two builds of the same report.
 const MIN_REBUILD_INTERVAL: Duration = Duration::from_secs(5);
@@ -180,7 +180,7 @@ mod tests {
 
     use super::*;
 
-    /// Number of reports that were built: of folders called `bad`, and of others.
+    /// Numbers of builds: of folders that are not called `bad` (0), and of folders called `bad` (1).
     static BUILT: [AtomicUsize; 2] = [AtomicUsize::new(0), AtomicUsize::new(0)];
 
     fn built(name: &str) -> usize {

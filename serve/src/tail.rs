@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use perturb_files::{Stamp, open_plain};
 
-/// Maximum number of bytes that one call reads. The next call continues from there. Lines that are longer are not read.
+/// Maximum number of bytes that one call reads. The next call continues after them. A longer line is not read.
 pub(crate) const MAX_READ_BYTES: u64 = 64 << 20;
 /// Number of bytes before the read position that are compared with the file again. A difference shows that the file was
 /// truncated and has grown again.

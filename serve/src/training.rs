@@ -138,7 +138,7 @@ impl LiveTraining {
         let cell = self.path.parent().filter(|_| self.path.ends_with("training"))?;
         let experiment = cell.parent().filter(|cells| cells.ends_with("cells"))?.parent()?;
         if !experiment.starts_with(&self.root) {
-            // The experiment's folder is outside of the served folder.
+            // Files of an experiment outside of the served folder are not read.
             return None;
         }
         if let Some(name) = ["result.json", "failure.json"].into_iter().find(|name| leads_out(&self.root, cell, name)) {

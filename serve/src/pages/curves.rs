@@ -84,12 +84,12 @@ pub(crate) fn page(root: &Root, chosen: &[RelativePath]) -> String {
     super::document(title, &format!("/events?runs={}", names.join(",")), &breadcrumbs, &main)
 }
 
-/// Returns the box that chooses a training in the list of all runs.
+/// Returns the checkbox by which a user chooses a training in the list of all runs.
 pub(super) fn choice_box(name: &str, relative: &RelativePath) -> Markup {
     html! { input type="checkbox" name="charted" value=(relative.encode()) aria-label={ "Draw " (name) } title="Draw with others"; " " }
 }
 
-/// Returns the link to the chosen trainings, which the script shows and completes.
+/// Returns the link to the curves of the chosen trainings. It is hidden until the script adds the trainings to it.
 pub(super) fn chosen_link() -> Markup {
     html! { p hidden { a #charted href="/curves" data-most=(MAX_TRAININGS) {} } }
 }

@@ -71,7 +71,7 @@ impl Update {
         json!({ "title": self.title, "parts": parts, "charts": self.charts, "report": report }).to_string()
     }
 
-    /// Returns a part of the page in an element that the script can replace.
+    /// Returns a part of the page, in an element that the page's script can replace.
     fn part(&self, name: &str) -> Markup {
         let content = self.parts.iter().find(|(known, _)| *known == name).map(|(_, part)| part);
         html! { div id=(name) data-part { @if let Some(content) = content { (content) } } }
@@ -268,7 +268,7 @@ pub(crate) fn message_page(status: StatusCode, message: &str) -> Response {
     (status, Extension(MessagePage(page.into_string()))).into_response()
 }
 
-/// Time after which browsers request a report again that could not be built, in seconds.
+/// Time after which browsers repeat the request for a report that could not be built, in seconds.
 const REPORT_RETRY_SECONDS: u32 = 15;
 
 /// Returns the page that is shown in place of a report.
