@@ -37,7 +37,7 @@ class Peer:
 
     name: str
     script: str
-    # Environment variables in addition to the inherited ones.
+    # Environment variables of the peer's process, in addition to those of this process.
     environ: dict[str, str] = field(default_factory=dict)
 
 
@@ -68,7 +68,7 @@ class Contest:
 
     @property
     def name(self) -> str:
-        """The id of the contest, in the format of the other benchmarks' ids."""
+        """The id of the contest, in the same format as the ids of `benches/serving`."""
         return f"{self.algorithm}_ff/{self.environment}/{self.num_envs}x{self.n_steps}"
 
     @property

@@ -49,7 +49,7 @@ compiled = jax.jit(
 
 
 def train(seed: int) -> Training:
-    """Train once. The first call also compiles."""
+    """Train once. The first call also compiles the training."""
     key = jax.random.PRNGKey(seed)
     start = time.perf_counter()
     outcome = jax.block_until_ready(compiled(key))

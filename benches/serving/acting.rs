@@ -1,4 +1,4 @@
-//! The cost of a policy that acts on the server, compared with computing its actions alone.
+//! The cost of a policy that acts on the server, compared with only computing the policy's actions.
 
 use super::{
     Failure, ROUNDS,

@@ -23,7 +23,7 @@ const HOPPER: (usize, usize) = (1 << 13, 2);
 /// Number of round trips in a round with one environment.
 const TRIPS: usize = 2000;
 
-/// Two sessions with the same environments: on this server, and on the other program.
+/// Two sessions with the same environments, one on this server and one on the other executable.
 struct Pair {
     clients: [Client; 2],
     _servers: [ServerProcess; 2],

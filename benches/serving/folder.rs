@@ -1,4 +1,5 @@
-//! The cost of tasks that are loaded from folders, compared with the built-in Hopper and with MuJoCo's functions alone.
+//! The cost of tasks that are loaded from folders, compared with the built-in Hopper and with only the calls of
+//! MuJoCo's functions.
 //!
 //! - `step/folder/Hopper`: the built-in Hopper's model as a folder with similar reward terms, compared with the
 //!   built-in task. Measures the steps per second of 64 environments, on one server with two workers.

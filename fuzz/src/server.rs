@@ -225,9 +225,9 @@ async fn call<T: AsyncRead + AsyncWrite + Unpin + Send + 'static>(connection: T,
             replies.extend_from_slice(&data);
         }
         if let Ok(Some(trailers)) = downwards.trailers().await {
-            let told = |name| trailers.get(name).map(|value| String::from_utf8_lossy(value.as_bytes()).into_owned());
-            let message = told("grpc-message").unwrap_or_default();
-            assert!(told("grpc-status").as_deref() != Some(INTERNAL) || !message.contains("defect"), "{message}");
+            let trailer = |name| trailers.get(name).map(|value| String::from_utf8_lossy(value.as_bytes()).into_owned());
+            let message = trailer("grpc-message").unwrap_or_default();
+            assert!(trailer("grpc-status").as_deref() != Some(INTERNAL) || !message.contains("defect"), "{message}");
         }
     }
     drop(client);

@@ -10,13 +10,13 @@ pub struct Counters {
     pub iterations: u64,
     /// Number of steps, summed over all environments. EPOpt counts only the steps of complete episodes.
     pub timesteps: u64,
-    /// Number of episodes that count towards the training's budget: all that ended or, with EPOpt, those that it
-    /// learned from.
+    /// Number of episodes that count towards the training's budget. These are all ended episodes or, with EPOpt, only
+    /// the episodes from which the policy learned.
     pub episodes: u64,
     /// Number of episodes that ended. EPOpt plays more episodes than it learns from.
     #[serde(default)]
     pub generated_episodes: u64,
-    /// Number of steps that were learned from.
+    /// Number of steps from which the policy learned.
     #[serde(default)]
     pub learned_timesteps: u64,
 }

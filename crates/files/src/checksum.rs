@@ -1,4 +1,4 @@
-//! Checksums of files. They turn a changed byte into an error, instead of a different result.
+//! Checksums of files. With a checksum, a changed byte causes an error and not an unnoticed wrong result.
 //!
 //! In a JSON document, the entry `crc32c` is the CRC-32C of the rest of the document, as compact JSON with sorted keys.
 //! This makes the checksum independent of spaces and of the order of entries. Any other file contains `perturb.crc32c=`

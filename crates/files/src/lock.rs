@@ -32,7 +32,7 @@ impl Drop for Lock {
 impl Lock {
     /// Takes the lock of `folder`. Creates the file `lock` in the folder if it is missing. Returns `None` if another
     /// process has the lock; a process that only [tests the lock](is_locked) does not count. On a file system without
-    /// locks, every process gets the lock, and the first time a warning is logged.
+    /// locks, every process gets the lock, and a warning is logged once.
     ///
     /// # Errors
     /// An error of the operating system.

@@ -9,7 +9,7 @@ use std::fmt;
 
 use crate::imports::{ModulePath, PackageImports};
 
-/// A cycle: sibling modules that all import each other, directly or through others.
+/// A cycle: sibling modules that all import each other, directly or through other modules of the cycle.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Cycle {
     /// The folder of the package.

@@ -71,7 +71,9 @@ impl Check {
     /// Describes the counted findings and how to remove them, for error messages.
     fn explanation(self) -> &'static str {
         match self {
-            Self::ImportCycles => "modules in import cycles; move what both need to a module below them",
+            Self::ImportCycles => {
+                "modules in import cycles; move the code that they share to a module that imports none of them"
+            }
             Self::DocComments => "% of the doc comments open without a subject; name the subject or begin with a verb",
             Self::TypesDefinedTwice => {
                 "type names with two definitions; rename one, or give the reason in crates/lint/duplicate-names.toml"

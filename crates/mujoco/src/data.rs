@@ -157,8 +157,8 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
-    /// Recomputes the arrays of the model that follow from edited ones, such as masses of subtrees. Overwrites the
-    /// positions, so reset or set the state afterwards. Also overwrites [`Field::Statistic`], even if the MJCF text
+    /// Recomputes the arrays of the model that follow from edited arrays, such as the masses of subtrees. Overwrites
+    /// the positions, so reset or set the state afterwards. Also overwrites [`Field::Statistic`], even if the MJCF text
     /// sets it explicitly.
     ///
     /// # Errors

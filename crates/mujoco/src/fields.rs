@@ -178,7 +178,8 @@ model_arrays! {
     Index: i32, {
         /// Index of each body's parent body, `[bodies]`.
         BodyParent = body_parentid: |m| m.nbody,
-        /// Index of the body to which each body is rigidly attached, or its own, `[bodies]`. 0 is the world.
+        /// Index of the body to which each body is rigidly attached, `[bodies]`. It is the body's own index if the body
+        /// can move relative to its parent. 0 is the world.
         BodyWeld = body_weldid: |m| m.nbody,
         /// Types of joints, `[joints]`: 0 free, 1 ball, 2 slide, 3 hinge.
         JointType = jnt_type: |m| m.njnt,
@@ -215,8 +216,8 @@ model_arrays! {
         ActuatorGainType = actuator_gaintype: |m| m.nu,
         /// Types of the actuators' biases, `[actuators]`: 0 none, 1 affine.
         ActuatorBiasType = actuator_biastype: |m| m.nu,
-        /// Types of the actuators' transmissions, `[actuators]`: 0 to a joint, 1 to a joint in its parent's frame;
-        /// others to other elements.
+        /// Types of the actuators' transmissions, `[actuators]`: 0 to a joint, 1 to a joint in its parent's frame.
+        /// Other types act on elements that are not joints.
         ActuatorTransmission = actuator_trntype: |m| m.nu,
         /// Indices of the elements on which each actuator acts, `[actuators, 2]`.
         ActuatorTarget = actuator_trnid: |m| 2 * m.nu,

@@ -28,7 +28,8 @@ pub struct Actor {
     log_std: Vec<f32>,
     /// Whether continuous actions are sampled uniformly from a box instead of from a Gaussian.
     uniform: bool,
-    /// Whether the networks were swapped for others. The actor then refuses to act until weights are loaded.
+    /// Whether the networks were exchanged with those of a differentiator. The actor then refuses to act until weights
+    /// are loaded.
     is_stale: bool,
 }
 
@@ -132,9 +133,9 @@ impl Actor {
         }
     }
 
-    /// Returns the networks and log σ `[A]` of a feed-forward policy, so that the caller can swap the networks for
-    /// others. The actor then refuses to act until weights are loaded. Returns `None` if the policy is recurrent or its
-    /// shape is not `spec`.
+    /// Returns the networks and log σ `[A]` of a feed-forward policy, so that the caller can swap them for its own
+    /// networks. The actor then refuses to act until weights are loaded. Returns `None` if the policy is recurrent or
+    /// its shape is not `spec`.
     pub(crate) fn give_networks(&mut self, spec: &PolicySpec) -> Option<(&mut FeedForward, &[f32])> {
         match &mut self.network {
             Network::FeedForward(network) if self.spec == *spec => {

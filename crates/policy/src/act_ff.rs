@@ -39,8 +39,8 @@ pub(crate) struct FeedForward {
     activations: Activations,
     /// Maximal number of rows in the cache; 0 if nothing is cached.
     max_cached: usize,
-    /// Number of rows in the cache: every observation since the weights were loaded. `None` if there were more than
-    /// `max_cached`, or if no weights are loaded.
+    /// Number of rows in the cache. The cache has a row for every observation since the weights were loaded. `None` if
+    /// there were more than `max_cached` observations, or if no weights are loaded.
     cached: Option<usize>,
 }
 

@@ -155,8 +155,8 @@ impl Kernel for RecurrentStep<'_> {
     }
 }
 
-/// Computes the LSTM of one environment. Replaces the cell states `c` and the outputs `h` by those after the step.
-/// `sums` holds the pre-activations of the gates i, f, g and o, and is overwritten.
+/// Computes the LSTM of one environment. Replaces the cell states `c` and the outputs `h` by their values after the
+/// step. `sums` holds the pre-activations of the gates i, f, g and o, and is overwritten.
 #[inline(always)]
 fn cell(sums: &mut [f32], h: &mut [f32], c: &mut [f32]) {
     let width = c.len();

@@ -105,10 +105,9 @@ impl Differentiator {
         if self.is_current { Ok(()) } else { self.load(weights) }
     }
 
-    /// Takes over the networks of an actor that has the weights for the next gradient, instead of loading them, which
-    /// takes longer. Also takes over the activations that [the actor has cached](Actor::keep_activations). In exchange
-    /// the actor gets this differentiator's networks, and refuses to act until weights are loaded
-    /// ([`Error::NoWeights`]).
+    /// Takes over the networks of an actor that has the weights for the next gradient. This is faster than loading the
+    /// weights. Also takes over the activations that [the actor has cached](Actor::keep_activations). In exchange the
+    /// actor gets this differentiator's networks, and refuses to act until weights are loaded ([`Error::NoWeights`]).
     ///
     /// Returns whether the actor's policy is feed-forward and has the same shape. If not, nothing is exchanged.
     #[must_use]
@@ -129,7 +128,7 @@ impl Differentiator {
         }
     }
 
-    /// Returns whether the first part's cached activations are those of exactly the samples at `indices`.
+    /// Returns whether the cached activations in the first part belong to exactly the samples at `indices`.
     fn has_computed(&self, samples: &Samples<'_>, indices: &[u32]) -> bool {
         let size = self.spec.observation_size;
         let are_all = indices.len() == self.computed && indices.iter().enumerate().all(|(b, &i)| i as usize == b);
@@ -141,7 +140,7 @@ impl Differentiator {
     }
 
     /// Writes the gradient of the total loss over the samples at `indices`, with respect to `weights` `[P]`, to
-    /// `gradient` `[P]`. `weights` must be those that were loaded. Returns the losses.
+    /// `gradient` `[P]`. The same `weights` must have been loaded before. Returns the losses.
     ///
     /// # Errors
     /// [`Error::Length`] if an array has the wrong length, [`Error::NoSamples`] if `indices` is empty.

@@ -42,11 +42,12 @@ fn gain(spec: &PolicySpec, name: &str) -> f64 {
     }
 }
 
-/// Draws a matrix `[rows, columns]` uniformly from those with orthogonal vectors of length `gain` along the shorter
-/// axis (Saxe et al., 2014, arXiv:1312.6120). Applies Gram-Schmidt orthogonalisation to normal vectors, in f64.
+/// Draws a matrix `[rows, columns]` with orthogonal rows of length `gain`, or with orthogonal columns if it has fewer
+/// columns than rows. The distribution is uniform over such matrices (Saxe et al., 2014, arXiv:1312.6120). Applies
+/// Gram-Schmidt orthogonalisation, in f64, to vectors of normally distributed numbers.
 ///
-/// A second pass of Gram-Schmidt removes the rounding errors of the first, so that Wᵀ W = gain² I holds up to the
-/// rounding of the result to f32.
+/// A second pass of Gram-Schmidt removes the rounding errors of the first pass. The vectors are then orthogonal up to
+/// the rounding of the result to f32.
 fn orthogonal(rows: usize, columns: usize, gain: f64, rng: &mut ChaCha8Rng) -> Vec<f32> {
     let count = rows.min(columns);
     let length = rows.max(columns);

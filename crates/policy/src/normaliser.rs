@@ -125,7 +125,7 @@ impl RunningMoments {
 #[serde(deny_unknown_fields)]
 pub struct ObservationNormaliser {
     moments: RunningMoments,
-    /// Number of elements at the end that are neither normalised nor added to the statistics.
+    /// Number of elements at the end of an observation that are neither normalised nor added to the statistics.
     #[serde(default, skip_serializing_if = "is_zero")]
     left_alone: usize,
 }

@@ -129,12 +129,12 @@ struct LayerBackward {
 impl Backward {
     /// Creates the backward pass through `perceptron`, with buffers for batches of `n` rows.
     pub(crate) fn new(perceptron: &Perceptron, n: usize) -> Self {
-        let of = |layer: &Layer| LayerBackward {
+        let backward = |layer: &Layer| LayerBackward {
             inputs: layer.inputs,
             outputs: layer.outputs,
             deltas: Rows::new(n, layer.outputs),
         };
-        let layers: Vec<_> = perceptron.layers.iter().map(of).collect();
+        let layers: Vec<_> = perceptron.layers.iter().map(backward).collect();
         Backward { n_weights: layers.iter().map(LayerBackward::n_weights).sum(), layers }
     }
 

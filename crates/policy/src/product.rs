@@ -371,7 +371,8 @@ fn outers<S: Simd, const R: usize, const ADD: bool, const WHOLE: bool>(
     let deltas = deltas.lanes(n).as_flattened();
     let sums = &mut sums[first * size + column * LANES..];
     let left = if WHOLE { LANES } else { size % LANES };
-    // `lanes` holds sums of a lane with fewer than `LANES` inputs, or the earlier sums with `ADD`.
+    // `lanes` is a buffer of whole lanes. With `ADD` it starts with the values of `sums`. If the lane has fewer than
+    // [`LANES`] inputs, it also collects the results.
     let mut lanes = [ZERO; R];
     if ADD {
         for r in 0..R {

@@ -171,11 +171,11 @@ mod tests {
     #[test]
     fn open_end_is_null() {
         let open = Channel { name: "x".into(), unit: "m".into(), low: f64::NEG_INFINITY, high: 1.5 };
-        let told = to_json(&ListEnvironmentsResponse {
+        let json = to_json(&ListEnvironmentsResponse {
             environments: vec![Environment { observation: vec![open], ..Environment::default() }],
             ..ListEnvironmentsResponse::default()
         });
         let expected = json!([{ "name": "x", "unit": "m", "low": null, "high": 1.5 }]);
-        assert_eq!(told["environments"][0]["observation"], expected);
+        assert_eq!(json["environments"][0]["observation"], expected);
     }
 }

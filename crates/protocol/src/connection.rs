@@ -232,13 +232,14 @@ pub struct ResolvedAddresses {
     /// Addresses of the IP version, 4 or 6, that the resolver listed first. Different addresses count as different
     /// machines.
     pub preferred: Vec<Address>,
-    /// Addresses of the other IP version, assumed to belong to the same machines.
+    /// Addresses of the IP version that the resolver listed later. They are assumed to belong to the same machines as
+    /// `preferred`.
     pub fallback: Vec<Address>,
 }
 
 impl ResolvedAddresses {
-    /// Returns all addresses in the order in which to try them. The preferred ones come first, rotated left by `turn`
-    /// positions, so that clients with different turns begin with different machines.
+    /// Returns all addresses in the order in which to try them. The preferred addresses come first, rotated left by
+    /// `turn` positions. Clients with different values of `turn` thus begin with different machines.
     pub fn into_order(mut self, turn: usize) -> Vec<Address> {
         if !self.preferred.is_empty() {
             let first = turn % self.preferred.len();

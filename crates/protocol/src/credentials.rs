@@ -35,7 +35,7 @@ const MAX_TOKEN_FILE_BYTES: u64 = 64 << 10;
 /// A function that returns the value of an environment variable, if it is set.
 type Variable<'a> = &'a dyn Fn(&str) -> Option<OsString>;
 
-/// The credentials of a client. They are read anew for each connection, so the files may be replaced while a program
+/// The credentials of a client. The files are read again for each connection, so they may be replaced while a program
 /// runs.
 #[derive(Default)]
 pub struct Credentials {

@@ -7,9 +7,9 @@ use crate::proto;
 pub struct EndedEpisode {
     /// The index of the environment in the session's batch, 0 … N-1.
     pub slot: usize,
-    /// The environment's index, which with the seed fixes its random numbers. By default the environments that are
-    /// opened together count from 0. A client may give another first index, and a restored snapshot brings its own
-    /// index.
+    /// The environment's index, which with the seed fixes its random numbers. By default, the environments of a session
+    /// have the indices 0 … N-1. A client may request another first index, and a restored snapshot contains its
+    /// environment's index.
     pub environment_index: u32,
     /// The number of the episode, counted from 0 for each environment.
     pub episode_index: u64,

@@ -63,7 +63,9 @@ pub enum ClientError {
         action: String,
     },
     /// A reply does not follow the protocol.
-    #[error("the server at {address} answered {request} with {got}, expected {expected}: are both of one version?")]
+    #[error(
+        "the server at {address} answered {request} with {got}, expected {expected}: do client and server have the same version?"
+    )]
     Protocol { address: Address, request: &'static str, got: String, expected: String },
     /// The servers of one run describe an environment differently.
     #[error("the servers at {first} and {other} describe {environment} differently: run one version of perturb-server")]

@@ -93,7 +93,7 @@ pub struct DrawRecord {
 /// Environments that begin to draw from a region. The seed, the environment's index and the episode's number determine
 /// each episode's random numbers.
 ///
-/// It is serialised as an array of its fields, in order. The objects of older servers can be read, too.
+/// It is serialised as an array of its fields, in order. Older servers wrote it as an object, which can also be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]
 pub struct DrawStart {
     /// The seed of the environments.
@@ -306,7 +306,7 @@ mod tests {
         written(&path, &["ann", "bob", "cid"]);
         let whole = std::fs::read_to_string(&path).unwrap();
         let lines: Vec<&str> = whole.split_inclusive('\n').collect();
-        let of = |text: String| {
+        let read_changed = |text: String| {
             std::fs::write(&path, text).unwrap();
             read(&path, |_, _| {})
         };
@@ -320,12 +320,12 @@ mod tests {
             (format!("{whole}\n"), 4),
             ("no ledger\n".to_owned(), 1),
         ] {
-            match of(text) {
+            match read_changed(text) {
                 Err(Error::Broken { line: got, .. }) => assert_eq!(got, line),
                 other => panic!("{other:?}"),
             }
         }
-        let cut = of(whole[..whole.len() - 1].to_owned()).unwrap();
+        let cut = read_changed(whole[..whole.len() - 1].to_owned()).unwrap();
         assert_eq!((cut.chain.lines(), cut.unfinished), (2, lines[2].len() as u64 - 1), "its end was never written");
     }
 }

@@ -294,7 +294,7 @@ impl Scanner {
         }
     }
 
-    /// Returns whether the `.` at `position` is the second one of `..`.
+    /// Returns whether the `.` at `position` is the second `.` of `..`.
     fn is_range(&self, position: usize) -> bool {
         position > 0 && self.tokens[position - 1].is_symbol('.')
     }

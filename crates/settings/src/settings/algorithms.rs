@@ -59,8 +59,8 @@ pub struct A2cConfig {
     pub max_grad_norm: f64,
     /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
     /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
-    /// actions closer to 1. A file contains this setting only if it is not the default. Other files are therefore the
-    /// same as before this setting existed.
+    /// actions closer to 1. `config.toml` contains this setting only if it is not the default. Without it, the file has
+    /// the same bytes as in earlier versions, which did not have the setting.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Decay per update of RMSProp's running average of squared gradients, at least 0 and below 1 (default: `0.99`).
@@ -159,8 +159,8 @@ pub struct PpoConfig {
     pub max_grad_norm: f64,
     /// Weight decay λ: each gradient step multiplies every weight by 1 - learning rate · λ. Not negative, and below 1 /
     /// `learning_rate` (default: `0`). A larger value keeps outputs closer to 0, and standard deviations of continuous
-    /// actions closer to 1. A file contains this setting only if it is not the default. Other files are therefore the
-    /// same as before this setting existed.
+    /// actions closer to 1. `config.toml` contains this setting only if it is not the default. Without it, the file has
+    /// the same bytes as in earlier versions, which did not have the setting.
     #[serde(skip_serializing_if = "is_zero")]
     pub weight_decay: f64,
     /// Adam's ε, above 0 (default: `1e-5`). This limits the step of weights with small gradients.
@@ -234,8 +234,8 @@ pub struct EpoptConfig {
     /// normalised rewards changes during an iteration, so with "normalized" the rank of equal episodes depends on their
     /// order.
     pub rank_by: Ranking,
-    /// Whether the policy is updated on one kept episode after the other, instead of once on all of them (default:
-    /// `false`; paper: `true` with RC). Each epoch of PPO then goes through all kept episodes.
+    /// Whether each of the selected episodes has a separate update, instead of one update on all of them (default:
+    /// `false`; paper: `true` with RC). Each epoch of PPO then goes through all selected episodes.
     pub update_per_episode: bool,
 }
 
@@ -277,10 +277,10 @@ impl EpoptConfig {
 /// wraps.
 ///
 /// A trial consists of N episodes with the same drawn parameters. The policy is recurrent and keeps its memory from one
-/// episode of a trial to the next. Besides the observation, it gets its last action, reward and done flag (the
-/// learner's `Inputs`). Returns and advantages continue across the episodes of a trial. Therefore the best policy uses
-/// the first steps of a trial to find out which parameters it has. Updates are those of A2C or PPO, with
-/// [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO; only the collection of rollouts differs.
+/// episode of a trial to the next. Besides the observation, the policy gets its last action, reward and done flag
+/// (`perturb_policy::Inputs`). Returns and advantages continue across the episodes of a trial. Therefore the best
+/// policy uses the first steps of a trial to find out which parameters the environment has. Updates are those of A2C or
+/// PPO, with [`kl_coef`](PpoConfig::kl_coef) for RL²-PPO; only the collection of rollouts differs.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default)]
 pub struct Rl2Config {

@@ -35,7 +35,7 @@ impl Method {
     }
 
     /// Returns whether the method only serves as a reference: it learns nothing, or its policies observe parameters
-    /// that others have to infer.
+    /// that the policies of other methods have to infer.
     pub fn is_reference(&self) -> bool {
         self.is_random() || self.observe.sees_parameters()
     }

@@ -89,8 +89,8 @@ pub struct Common {
     /// The network architecture of the policy.
     pub architecture: Architecture,
     /// The observation of the policy in training and in tests: "state", or "parameters" for the state and the current
-    /// parameters of the environment (default: `"state"`). A file contains this setting only if it is not the default.
-    /// Other files are therefore the same as before this setting existed.
+    /// parameters of the environment (default: `"state"`). `config.toml` contains this setting only if it is not the
+    /// default. Without it, the file has the same bytes as in earlier versions, which did not have the setting.
     #[serde(default, skip_serializing_if = "Observe::is_default")]
     pub observe: Observe,
     /// The number of episodes after which training ends, at least 1 (default: `15000`). The last iteration is
@@ -104,8 +104,9 @@ pub struct Common {
     /// Whether observations are normalised by their running mean and variance (default: `true`).
     pub normalize_observations: bool,
     /// Standard deviation of normally distributed noise that is added to every number of an observation in training,
-    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. A file contains this setting
-    /// only if it is not the default. Other files are therefore the same as before this setting existed.
+    /// after normalisation if there is any, 0 … 100 (default: `0`). Tests have no noise. `config.toml` contains this
+    /// setting only if it is not the default. Without it, the file has the same bytes as in earlier versions, which did
+    /// not have the setting.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub observation_noise: f64,
     /// Whether rewards are divided by the running standard deviation of the discounted return (default: `true`).
@@ -120,8 +121,9 @@ pub struct Common {
     /// iteration always write a checkpoint.
     pub checkpoint_interval: u64,
     /// A success rate in %, 0 … 100, at which training ends early: after the iteration in which the last 100 ended
-    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. A file contains
-    /// this setting only if it is not the default. Other files are therefore the same as before this setting existed.
+    /// episodes reach it (default: `0`, which is never). Longer training can impair generalisation. `config.toml`
+    /// contains this setting only if it is not the default. Without it, the file has the same bytes as in earlier
+    /// versions, which did not have the setting.
     #[serde(default, skip_serializing_if = "is_zero")]
     pub stop_at_success: f64,
 }
