@@ -108,7 +108,7 @@ impl TestCollector {
         test.axes = Heatmap::axes_of(&test.set, environment);
         counted.sort_by_key(|end| (end.environment_index, end.episode_index));
         let contexts = test.set.listed();
-        let asked: Vec<_> = contexts.iter().map(|context| asked(environment, &test.set, context)).collect();
+        let asked: Vec<_> = contexts.iter().map(|context| permitted_values(environment, &test.set, context)).collect();
         for end in &counted {
             check_requested(environment, &test.set, &asked[end.slot % contexts.len()], &end.receipt.requested)?;
         }
@@ -126,7 +126,7 @@ impl TestCollector {
 
 /// Returns the permitted values of all parameters in one context of a set, `[alternatives][parameters]`. Version R+E has
 /// two alternatives, because a trial draws either all parameters from R or all from E. Other versions have one.
-fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
+fn permitted_values(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {
         environment.parameters.iter().filter_map(|parameter| values.get(&parameter.name).cloned()).collect()
@@ -135,14 +135,14 @@ fn asked(environment: &proto::Environment, set: &TestSet, context: &Context) -> 
 }
 
 /// Checks `requested`, the values that the server reports as requested for an episode. `asked` has the values that the
-/// test permits, see [`asked`]. In version R+E, all values must be from R or all from E.
+/// test permits, see [`permitted_values`]. In version R+E, all values must be from R or all from E.
 fn check_requested(
     environment: &proto::Environment,
     set: &TestSet,
     asked: &[Vec<Distribution>],
     requested: &[f64],
 ) -> Result<(), NotRecorded> {
-    let Some(index) = wrong(asked, requested) else { return Ok(()) };
+    let Some(index) = forbidden_index(asked, requested) else { return Ok(()) };
     let sets: Vec<String> = asked.iter().map(|asked| asked[index].to_string()).collect();
     Err(NotRecorded::NotRequested {
         set: set.name.clone(),
@@ -154,7 +154,7 @@ fn check_requested(
 
 /// Returns the index of a parameter outside of its permitted values, or `None` if one alternative of `asked` permits
 /// all of them.
-fn wrong(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
+fn forbidden_index(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     let in_part = |asked: &Vec<Distribution>| {
         let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));
         asked.iter().zip(requested).position(|(asked, got)| !asked.contains(got))
@@ -213,9 +213,9 @@ mod tests {
     #[test]
     fn the_first_episodes_of_each_environment_count_in_their_order() {
         let records = finished(Version::D, &[end(1, 0, 1.0, 1.0), end(1, 1, 1.0, 1.0), end(0, 0, 1.0, 1.0)]).unwrap();
-        let told: Vec<(u32, u64, Ending)> =
+        let recorded: Vec<(u32, u64, Ending)> =
             records.episodes.iter().map(|row| (row.environment_index, row.episode_index, row.ending)).collect();
-        assert_eq!(told, [(0, 0, Ending::Terminated), (1, 0, Ending::Truncated)]);
+        assert_eq!(recorded, [(0, 0, Ending::Terminated), (1, 0, Ending::Truncated)]);
         assert_eq!(records.about.tests[0].seed, environment_seed(Purpose::TestEnvironments, 1, Version::D));
     }
 
@@ -237,11 +237,11 @@ mod tests {
         let part = |low, high| vec!["low..high".replace("low", low).replace("high", high).parse().unwrap(); 2];
         let (r, e) = (part("1", "2"), part("2", "3"));
         let both = [r, e];
-        assert_eq!([wrong(&both, &[1.5, 1.0]), wrong(&both, &[2.5, 3.0])], [None, None]);
-        assert_eq!(wrong(&both, &[1.5, 2.5]), Some(1), "the second is not of R, the first not of E");
-        assert_eq!(wrong(&both, &[4.0, 1.5]), Some(0));
+        assert_eq!([forbidden_index(&both, &[1.5, 1.0]), forbidden_index(&both, &[2.5, 3.0])], [None, None]);
+        assert_eq!(forbidden_index(&both, &[1.5, 2.5]), Some(1), "the second is not of R, the first not of E");
+        assert_eq!(forbidden_index(&both, &[4.0, 1.5]), Some(0));
         assert_eq!(
-            (wrong(&both[..1], &[1.5, 2.5]), wrong(&both[..1], &[1.5])),
+            (forbidden_index(&both[..1], &[1.5, 2.5]), forbidden_index(&both[..1], &[1.5])),
             (Some(1), Some(1)),
             "nor is what is missing"
         );

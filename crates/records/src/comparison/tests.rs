@@ -183,21 +183,21 @@ fn rows_that_are_no_conditions_are_refused() {
         compare_rows(conditions, sets, ComparedScore::Success, None).unwrap_err().to_string()
     };
     let both = [table_row("a2c", 1, "D", 1), table_row("ppo", 1, "D", 1)];
-    let told = error(&[rows("all", &both)], None);
-    assert!(told.contains("several policies of seed 1, which differ by algorithm"), "{told}");
+    let text = error(&[rows("all", &both)], None);
+    assert!(text.contains("several policies of seed 1, which differ by algorithm"), "{text}");
     let twice = [both[0].clone(), both[0].clone()];
-    let told = error(&[rows("two tables", &twice)], None);
-    assert!(told.contains("several policies of seed 1, which differ by study"), "{told}");
+    let text = error(&[rows("two tables", &twice)], None);
+    assert!(text.contains("several policies of seed 1, which differ by study"), "{text}");
     let other = [TableRow { environment: "Acrobot".into(), ..both[1].clone() }];
-    let told = error(&[rows("a", &both[..1]), rows("b", &other)], None);
-    assert!(told.contains("in Acrobot (revision 1), CartPole (revision 1), but must be one environment"), "{told}");
-    let told = error(&[rows("a", &both[..1])], Some(&["E".to_owned()]));
-    assert!(told.contains("sets that all policies were tested on: D"), "{told}");
+    let text = error(&[rows("a", &both[..1]), rows("b", &other)], None);
+    assert!(text.contains("in Acrobot (revision 1), CartPole (revision 1), but must be one environment"), "{text}");
+    let text = error(&[rows("a", &both[..1])], Some(&["E".to_owned()]));
+    assert!(text.contains("sets that all policies were tested on: D"), "{text}");
     let own = [table_row("a2c", 1, "long", 1)];
     let elsewhere = [TableRow { study: "other".into(), ..own[0].clone() }];
     assert!(compare_rows(&[rows("a", &own)], None, ComparedScore::Success, None).is_ok());
-    let told = error(&[rows("a", &own), rows("b", &elsewhere)], None);
-    assert!(told.contains("without tests"), "studies may call different sets by the same name: {told}");
+    let text = error(&[rows("a", &own), rows("b", &elsewhere)], None);
+    assert!(text.contains("without tests"), "studies may call different sets by the same name: {text}");
     assert!(error(&[rows("a", &[])], None).contains("without policies"));
 }
 

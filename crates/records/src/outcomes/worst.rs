@@ -59,7 +59,7 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     // Ranks the regions by their success rate in half `chooses` (0 or 1), and measures success in the other half.
     let mut one_way = |chooses: usize| {
         parts.sort_by(|a, b| a.rate(chooses).total_cmp(&b.rate(chooses)));
-        judged(&parts, chooses)
+        worst_success_rate(&parts, chooses)
     };
     // Averages both assignments of the halves, and converts the result to %.
     Some(50.0 * (one_way(0) + one_way(1)))
@@ -68,7 +68,7 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
 /// Returns the success rate, 0 … 1, in the worst tenth of the regions `parts`. The episodes of half `chooses`, 0 or 1,
 /// determine which regions are worst. The returned rate is measured in the other half. `parts` must be sorted by the
 /// success rate in half `chooses`.
-fn judged(parts: &[ContextGroup], chooses: usize) -> f64 {
+fn worst_success_rate(parts: &[ContextGroup], chooses: usize) -> f64 {
     let judges = 1 - chooses;
     let mut wanted = SHARE * parts.iter().map(|part| part.episodes[chooses]).sum::<f64>();
     let (mut successes, mut episodes) = (0.0, 0.0);
