@@ -99,12 +99,12 @@ impl Plot for HeatmapPanels {
             for row in self.rows() {
                 let captions = self.caption_lines(row);
                 for (column, (of, caption)) in row.iter().zip(&captions).enumerate() {
-                    let frame = self.frame(column, top + LINE * most(&captions));
+                    let frame = self.frame(column, top + LINE * max_lines(&captions));
                     let first = frame.top - LINE * caption.len() as f64;
                     canvas.lines(caption, (frame.middle().0, first), TextAnchor::Middle)?;
                     match &of.content {
                         Ok(heatmap) => self.panel(&canvas, &frame, heatmap, quantity)?,
-                        Err(why) => canvas.apology(&frame, why)?,
+                        Err(why) => canvas.missing_note(&frame, why)?,
                     }
                     canvas.frame(&frame, false)?;
                     canvas.x_ticks(&frame, true)?;
@@ -128,7 +128,7 @@ impl Plot for HeatmapPanels {
 }
 
 /// Returns the number of lines of the text with the most lines.
-fn most(texts: &[Vec<String>]) -> f64 {
+fn max_lines(texts: &[Vec<String>]) -> f64 {
     texts.iter().map(Vec::len).max().unwrap_or(0) as f64
 }
 
@@ -183,7 +183,7 @@ impl HeatmapPanels {
 
     /// Returns the height of a row with captions, panels and tick numbers, in units.
     fn row_height(&self, row: &[HeatmapColumn]) -> f64 {
-        LINE * most(&self.caption_lines(row)) + self.size().1 + NUMBERS + GAP
+        LINE * max_lines(&self.caption_lines(row)) + self.size().1 + NUMBERS + GAP
     }
 
     /// Draws a heatmap into its frame.
@@ -282,7 +282,7 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
     }
 
     /// Writes the reason why a heatmap is missing into its panel.
-    fn apology(&self, frame: &Frame, why: &str) -> Result<(), PlotError> {
+    fn missing_note(&self, frame: &Frame, why: &str) -> Result<(), PlotError> {
         let (right, bottom) = (frame.right(), frame.bottom());
         self.line(&[(frame.left, frame.top), (right, frame.top), (right, bottom)], TICK)?;
         let mut lines = wrapped(why, frame.width - 4.0);

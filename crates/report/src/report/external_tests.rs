@@ -167,6 +167,6 @@ fn another_revision_is_told() {
     let assessed = [agent];
     let mut selections = results.select();
     perturb_experiment::add_assessed(&mut selections, &assessed);
-    let told = sentences(&results, &selections);
-    assert!(told[2].contains("tested in revision 1 of CartPole, others in revision 2"), "{told:?}");
+    let lines = sentences(&results, &selections);
+    assert!(lines[2].contains("tested in revision 1 of CartPole, others in revision 2"), "{lines:?}");
 }

@@ -59,12 +59,12 @@ impl MethodMetrics<'_> {
 
     /// Returns the smallest number of runs of a metric; 0 if a metric is missing.
     pub(super) fn runs(&self) -> usize {
-        least(|metric| self.ours.get(&metric).map(|summary| summary.runs))
+        min_runs(|metric| self.ours.get(&metric).map(|summary| summary.runs))
     }
 
     /// Returns the smallest number of runs in an interquartile mean; 0 if a mean is missing.
     pub(super) fn iqm_runs(&self) -> usize {
-        least(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
+        min_runs(|metric| self.iqms.get(&metric).map(|iqm| iqm.runs))
     }
 }
 
@@ -172,6 +172,6 @@ fn zeros(selections: &[&MethodResults<'_>]) -> BTreeSet<Scenario> {
 }
 
 /// Returns the minimum over all metrics; a missing metric counts as 0.
-fn least(runs: impl Fn(Metric) -> Option<usize>) -> usize {
+fn min_runs(runs: impl Fn(Metric) -> Option<usize>) -> usize {
     Metric::ALL.into_iter().map(|metric| runs(metric).unwrap_or(0)).min().unwrap_or(0)
 }

@@ -131,13 +131,13 @@ fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
         Some(format!("{} ({} of {} tuning seeds)", name(tuned), chosen.seeds, tuned.seeds))
     });
     let partly: Vec<String> = partly.collect();
-    let told = [
+    let notes = [
         ("wait for tuning cells", waiting),
         ("have nothing to select, since all their tuning cells failed", none),
         ("are of configurations some of whose tuning cells failed", partly),
     ];
-    let told = told.into_iter().filter(|(_, names)| !names.is_empty());
-    told.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()
+    let notes = notes.into_iter().filter(|(_, names)| !names.is_empty());
+    notes.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()
 }
 
 /// Returns a sentence on the comparison of requested and applied parameters in recorded test episodes. Returns `None`

@@ -95,8 +95,8 @@ fn custom_sets_stand_beside_the_scenarios() {
     let report = Report::new(&results, &selections, &recorded, &checks);
     insta::assert_snapshot!(report.scenario_tables()[0].to_text());
     assert_eq!((selections.len(), selections[0].cells), (1, 1), "selected among those that are trained on versions");
-    let told = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
-    assert!(report.provenance.iter().any(|line| line.contains(told)), "{:?}", report.provenance);
+    let sentence = "compared in 8000 of 10000 test episodes; the largest relative difference is 2.0e-16, of length.";
+    assert!(report.provenance.iter().any(|line| line.contains(sentence)), "{:?}", report.provenance);
 }
 
 /// The plan has two configurations and two tuning seeds. On D, a tuning cell of the selected configuration failed. On
@@ -135,7 +135,7 @@ fn clean_report_names_rule_seeds_and_selection() {
     let selections = results.select();
     let recorded = Recorded::default();
     let report = Report::new(&results, &selections, &recorded, &[]);
-    let told = report.provenance.join("\n");
+    let sentences = report.provenance.join("\n");
     for part in [
         "Selection: `clean`. Configurations were selected by 70 selection episodes of every training on seeds 1 to 2; \
          those that are reported were trained anew on seeds 3 to 4, and tested on other episodes.",
@@ -144,7 +144,7 @@ fn clean_report_names_rule_seeds_and_selection() {
         "1 of 3 selections are of configurations some of whose tuning cells failed: CartPole ppo ff on D (1 of 2 tuning \
          seeds).",
     ] {
-        assert!(told.contains(part), "{told}");
+        assert!(sentences.contains(part), "{sentences}");
     }
     let table = |title: &str| report.files().into_iter().find(|table| table.title == title).unwrap();
     let metrics = String::from_utf8(table("metrics.csv").to_csv()).unwrap();
@@ -170,8 +170,8 @@ fn clean_report_names_rule_seeds_and_selection() {
 fn budgets_and_rules_are_told(#[case] given: &str, #[case] expected: &str) {
     let text = format!("environments = ['CartPole']\n{given}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
     let plan = Plan::parse("test", text).unwrap();
-    let told = with_no_result(&plan, |report| report.provenance.join("\n"));
-    assert!(told.contains(expected), "{told}");
+    let sentences = with_no_result(&plan, |report| report.provenance.join("\n"));
+    assert!(sentences.contains(expected), "{sentences}");
 }
 
 fn with_no_result<T>(plan: &Plan, of: impl FnOnce(&Report<'_>) -> T) -> T {
@@ -183,7 +183,7 @@ fn with_no_result<T>(plan: &Plan, of: impl FnOnce(&Report<'_>) -> T) -> T {
 #[test]
 fn a_single_row_lacks_cells_and_several_lack_them() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
-    let told = |missing: &[&str]| {
+    let sentences = |missing: &[&str]| {
         let results = fixture::results(&plan, |cell| {
             let Cell { config, .. } = cell;
             let is_missing = config.settings.name() == "a2c" && missing.contains(&config.common.environment.as_str());
@@ -192,8 +192,8 @@ fn a_single_row_lacks_cells_and_several_lack_them() {
         let selections = results.select();
         Report::new(&results, &selections, &Recorded::default(), &[]).provenance.join("\n")
     };
-    assert!(told(&["Pendulum"]).contains("1 of 4 rows lacks cells; the column"));
-    assert!(told(&["Pendulum", "CartPole"]).contains("2 of 4 rows lack cells; the column"));
+    assert!(sentences(&["Pendulum"]).contains("1 of 4 rows lacks cells; the column"));
+    assert!(sentences(&["Pendulum", "CartPole"]).contains("2 of 4 rows lack cells; the column"));
 }
 
 #[test]
