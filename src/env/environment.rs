@@ -200,7 +200,7 @@ pub trait Environment: Send {
 
     /// Writes the action with the least effect to `out`: a vector with an entry for each channel, or the index of a
     /// choice. By default each entry is the number in its range that is nearest to 0. The default choice is the middle
-    /// choice if their number is odd, otherwise the first choice.
+    /// choice if the number of choices is odd, otherwise the first choice.
     fn neutral_action(&self, out: &mut [f32]) {
         match self.spec().action {
             ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),

@@ -432,7 +432,8 @@ impl Batch {
         lists
     }
 
-    /// Gives each shard a command, which `make` makes from the shard's first slot and its list.
+    /// Gives each shard a command. `lists` has a list for each shard; `make` makes the command from the shard's first slot
+    /// and its list.
     fn command<T>(&self, lists: Vec<Vec<T>>, make: impl Fn(usize, Vec<T>) -> Command) {
         let mut lists = lists.into_iter();
         for shard in &self.job.shards {

@@ -23,27 +23,28 @@ struct Queue<T> {
     /// The virtual time of fair queueing: the number of pixels of each waiting entry that simultaneous drawing would
     /// have finished by now.
     clock: u64,
-    came: u64,
+    /// The number of entries that were added so far.
+    n_pushed: u64,
     closed: bool,
 }
 
 impl<T> Turns<T> {
     /// Creates an empty queue.
     pub(super) fn new() -> Self {
-        let queue = Queue { waiting: BTreeMap::new(), clock: 0, came: 0, closed: false };
+        let queue = Queue { waiting: BTreeMap::new(), clock: 0, n_pushed: 0, closed: false };
         Self { queue: Mutex::new(queue), ready: Condvar::new() }
     }
 
     /// Adds an entry that costs this number of pixels. If the queue is long, first removes the entries for which
-    /// `wanted` is false.
-    pub(super) fn push(&self, pixels: u64, item: T, wanted: impl Fn(&T) -> bool) {
+    /// `is_wanted` returns false.
+    pub(super) fn push(&self, pixels: u64, item: T, is_wanted: impl Fn(&T) -> bool) {
         let mut queue = self.lock();
         if queue.waiting.len() >= MIN_CLEANUP_LENGTH {
-            queue.waiting.retain(|_, (_, item)| wanted(item));
+            queue.waiting.retain(|_, (_, item)| is_wanted(item));
         }
-        queue.came += 1;
-        let turn = (queue.clock.saturating_add(pixels), queue.came);
-        queue.waiting.insert(turn, (pixels, item));
+        queue.n_pushed += 1;
+        let key = (queue.clock.saturating_add(pixels), queue.n_pushed);
+        queue.waiting.insert(key, (pixels, item));
         self.ready.notify_one();
     }
 

@@ -14,7 +14,7 @@ pub(super) struct ChangingPhysics {
     sets: [Vec<f64>; 2],
     /// The quantities of `EnvironmentSpec::applied` with the normal set and with the changed set.
     applied: [Vec<f64>; 2],
-    /// For each parameter, the index in `EnvironmentSpec::applied` of the quantity that reads it back.
+    /// For each parameter, the index in `EnvironmentSpec::applied` of the quantity that reads the parameter back.
     places: Vec<usize>,
     /// A buffer for the state of the physics during a change.
     state: Vec<f64>,

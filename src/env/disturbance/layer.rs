@@ -166,7 +166,7 @@ impl Environment for Disturbed {
     }
 }
 
-/// Draws whether this step has a push. Returns its impulse along x, y and z, or `None`.
+/// Draws whether step number `step` has a push. Returns the push's impulse along x, y and z; `None` without a push.
 fn impulse(values: &DisturbanceValues, draw: &Draw, step: u32, axes: &[usize]) -> Option<[f64; 3]> {
     let mut stream = Stream::at_step(draw, Purpose::Push, step);
     if stream.unit() * values.push_interval >= 1.0 {

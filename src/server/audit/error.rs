@@ -17,8 +17,8 @@ pub enum Error {
     Value(#[from] InvalidValue),
     /// The token's role does not allow the draw.
     #[error(
-        "a token of the role {role:?} may not draw from {region} of {environment}: {reason}; ask for what it may draw \
-         from, or who runs this server for another token"
+        "a token of the role {role:?} may not draw from {region} of {environment}: {reason}; request a region \
+         that it may draw from, or ask the operator of this server for another token"
     )]
     NotAllowed {
         /// The name of the role.
@@ -31,7 +31,9 @@ pub enum Error {
         reason: String,
     },
     /// The ledger cannot be written.
-    #[error("this server writes down what is drawn, and cannot: {reason}; try again later, or tell who runs it")]
+    #[error(
+        "this server must record each draw in its ledger, and cannot: {reason}; try again later, or tell its operator"
+    )]
     NoLedger {
         /// The cause.
         reason: String,

@@ -63,11 +63,15 @@ impl Ledger {
     /// If the file is not a valid ledger, another server is writing it, or it cannot be written.
     pub fn open(path: &Path) -> io::Result<Self> {
         if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
-            return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
+            return Err(io::Error::other(
+                "that is not a regular file, and the server must read its ledger at each start",
+            ));
         }
         let file = OpenOptions::new().read(true).append(true).create(true).mode(0o600).open(path)?;
         if !file.metadata()?.is_file() {
-            return Err(io::Error::other("that is no file, and a ledger is read again when the server begins"));
+            return Err(io::Error::other(
+                "that is not a regular file, and the server must read its ledger at each start",
+            ));
         }
         if is_taken(file.try_lock(), path)? == Some(false) {
             return Err(io::Error::other("another server writes it"));

@@ -169,8 +169,8 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
         };
         let max_entries = field.max_entries.entries(limits);
         if *counted > max_entries {
-            let got = format!("there more than {max_entries} times");
-            return Err(PrecheckError::Refused(InvalidValue::new(field.name, got, "no more than can be needed")));
+            let got = format!("present more than {max_entries} times");
+            return Err(PrecheckError::Refused(InvalidValue::new(field.name, got, format!("at most {max_entries}"))));
         }
         if let Fields(fields) = field.kind
             && !count(part, fields, limits, work)?
@@ -221,7 +221,7 @@ mod tests {
     fn entries_are_counted_whether_or_not_they_stand_in_a_row() {
         let reset = |seeds| proto::Reset { seeds, ..proto::Reset::default() };
         assert_eq!(checked(reset(vec![u64::MAX; 2000]), usize::MAX), Ok(()));
-        assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is there more than 2000 times"));
+        assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is present more than 2000 times"));
         let unpacked = [&[0x1A, 0xA2, 0x1F][..], &[0x10, 1].repeat(2001)].concat();
         assert!(matches!(check(&unpacked, SESSION_REQUEST, LIMITS, usize::MAX), Err(PrecheckError::Refused(_))));
         let policy = proto::Policy { hidden: vec![1; 1025], ..proto::Policy::default() };

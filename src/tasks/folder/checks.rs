@@ -195,7 +195,7 @@ fn friction(
     }))
 }
 
-/// Returns the smallest number that an edit can write into the model. The parameter has one of its bounds then.
+/// Returns the smallest number that an edit can write into the model, at the lower or upper bound of the parameter.
 fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
     let bounds = parameter.parameter.bounds;
     let numbers = edit
@@ -238,13 +238,13 @@ fn contacts_of(model: &Model, geom: usize) -> Vec<Contact> {
     let declared: Vec<(usize, usize)> = pairs.map(|(&a, &b)| (a as usize, b as usize)).collect();
     let weld_of = |geom: usize| weld[body[geom] as usize];
     let can_touch = |&other: &usize| {
-        let (own, its) = (weld_of(geom), weld_of(other));
+        let (own, theirs) = (weld_of(geom), weld_of(other));
         // Bodies that are welded together count as one body. `parent_of` returns the parent of such a body.
         let parent_of = |body: i32| weld[parent[body as usize] as usize];
         let fits = contact_type[geom] & affinity[other] != 0 || contact_type[other] & affinity[geom] != 0;
-        let related = own != 0 && its != 0 && (parent_of(own) == its || parent_of(its) == own);
+        let related = own != 0 && theirs != 0 && (parent_of(own) == theirs || parent_of(theirs) == own);
         let is_declared = declared.contains(&(geom, other)) || declared.contains(&(other, geom));
-        other != geom && own != its && fits && !related && !is_declared
+        other != geom && own != theirs && fits && !related && !is_declared
     };
     (0..model.n_geom())
         .filter(can_touch)

@@ -150,6 +150,8 @@ impl Recompilation {
         if model.has_sizes_of(own) {
             return Ok(model);
         }
-        Err(Error::Compile { reason: "the model has other numbers of elements than as it stands in the folder".into() })
+        Err(Error::Compile {
+            reason: "the edited model has other numbers of elements than the model in the folder".into(),
+        })
     }
 }

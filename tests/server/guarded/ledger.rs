@@ -146,7 +146,7 @@ async fn nothing_is_drawn_that_cannot_be_written_down() {
         }
         assert!(sessions.len() < 100, "all were written down");
     };
-    assert!(refusal.contains("writes down what is drawn, and cannot") && !sessions.is_empty(), "{refusal}");
+    assert!(refusal.contains("must record each draw in its ledger, and cannot") && !sessions.is_empty(), "{refusal}");
     for session in &mut sessions {
         super::steps(session, 1).await.expect("what is drawn already goes on");
     }
@@ -247,7 +247,7 @@ async fn a_ledger_that_was_tampered_with_is_noticed(#[case] tampering: Tampering
     logged(&server, part).await;
     assert_eq!(Page::scrape(&metrics).number("perturb_ledger_intact"), 0.0);
     let refusal = within(Stream::open(&connection, open("CartPole", 1, 2))).await.unwrap_err().to_string();
-    assert!(refusal.contains("writes down what is drawn, and cannot") && refusal.contains(part), "{refusal}");
+    assert!(refusal.contains("must record each draw in its ledger, and cannot") && refusal.contains(part), "{refusal}");
     super::steps(&mut session, 1).await.expect("what is drawn already goes on");
     // After the file is restored, the server continues to write it.
     match tampering {

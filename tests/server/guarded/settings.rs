@@ -40,7 +40,7 @@ fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[cas
 #[case::devices(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "expected a plain file")]
 #[case::endless_tokens(&["--tokens", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::folder(&["--tokens", "/"], "it is a folder, expected a file")]
-#[case::endless_ledger(&["--ledger", "/dev/zero"], "that is no file")]
+#[case::endless_ledger(&["--ledger", "/dev/zero"], "that is not a regular file")]
 #[case::endless_config(&["--config", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::decimal(&["--socket-mode", "438"], "no mode of a socket")]
 #[case::executable(&["--socket-mode", "0700"], "such as 0600")]

@@ -211,8 +211,8 @@ impl Registry {
     /// Returns the world with this name if the stream made it, the stream's agent has joined it, or it is shared.
     fn find_owned(&mut self, caller: &Caller, name: &str, request: &'static str) -> Result<&WorldEntry, Error> {
         let entry = self.find(caller, name)?;
-        let is_its = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
-        if is_its { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
+        let is_allowed = entry.shared || [entry.maker, entry.agent].contains(&Some(caller.stream));
+        if is_allowed { Ok(entry) } else { Err(Error::NotYours { world: name.into(), request }) }
     }
 
     /// Returns the world with this name among the worlds of the stream's token.
