@@ -89,7 +89,7 @@ class Contest:
 
 CONTESTS = [
     Contest("ppo", "CartPole", 8, 128, iterations=200, peers=(PUREJAXRL, PUREJAXRL_WITHOUT_THUNKS), min_length=60),
-    # perturb logs every 100th iteration of A2C.
+    # The number of iterations is a multiple of 100, because perturb logs only every 100th iteration of A2C.
     Contest("a2c", "CartPole", 16, 5, iterations=1500, peers=(STABLE_BASELINES3,), min_length=60),
     Contest("ppo", "HalfCheetah", 8, 128, iterations=60, peers=(STABLE_BASELINES3,), min_length=100),
 ]

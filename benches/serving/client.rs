@@ -35,7 +35,7 @@ impl Client {
         Self::with_spec(connection, tasks::catalogue().find(name)?, batch, &[]).await
     }
 
-    /// Opens an environment with fixed values of disturbances, given by name.
+    /// Opens an environment, given by its name, with fixed values of disturbances.
     pub(crate) async fn open_disturbed(
         socket: &Path,
         name: &str,

@@ -211,7 +211,7 @@ impl LocalEnvironments {
         Ok(())
     }
 
-    /// Runs only MuJoCo's timesteps for the steps of the preceding [`Self::step`].
+    /// Repeats the steps of the preceding call of [`Self::step`], but runs only MuJoCo's timesteps.
     fn bare(&mut self, actions: &[Bytes]) -> Result<(), Failure> {
         let power = self.spec.parameters[0].default;
         let mut begun = self.begun.iter().peekable();

@@ -113,13 +113,13 @@ pub enum CheckpointError {
         path.display()
     )]
     Missing {
-        /// The given path.
+        /// The path that the user gave.
         path: PathBuf,
     },
     /// The given name is not unique: the ids of several policies begin with it or resemble it.
     #[error("`{name}` could be any of these policies in {}, give the name or the path of one: {}", folder.display(), names.join(", "))]
     Several {
-        /// The given name.
+        /// The name that the user gave.
         name: String,
         /// The folder that was searched.
         folder: PathBuf,

@@ -384,7 +384,7 @@ impl Simulation {
         self.raw().time
     }
 
-    /// The generalised positions, `[n_q]`.
+    /// The generalised positions, `[n_q]`, in m and rad. Orientations of free and ball joints are unit quaternions.
     pub fn qpos(&self) -> &[f64] {
         self.array(self.raw().qpos, self.model.n_q())
     }
@@ -395,7 +395,7 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
-    /// The generalised velocities, `[n_v]`.
+    /// The generalised velocities, `[n_v]`, in m/s and rad/s.
     pub fn qvel(&self) -> &[f64] {
         self.array(self.raw().qvel, self.model.n_v())
     }
@@ -406,7 +406,8 @@ impl Simulation {
         self.array_mut(start, length)
     }
 
-    /// The generalised accelerations, `[n_v]`, of the last [`step2`](Self::step2) or [`forward`](Self::forward).
+    /// The generalised accelerations, `[n_v]`, in m/s² and rad/s², of the last [`step2`](Self::step2) or
+    /// [`forward`](Self::forward).
     pub fn qacc(&self) -> &[f64] {
         self.array(self.raw().qacc, self.model.n_v())
     }

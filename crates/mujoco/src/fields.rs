@@ -98,17 +98,19 @@ float_fields! {
     /// Friction coefficients of the pairs of geoms that the model declares, `[pairs, 5]`: two sliding, one torsional,
     /// two rolling.
     PairFriction = pair_friction: |m| 5 * m.npair,
-    /// Damping of degrees of freedom, `[dofs]`.
+    /// Damping of degrees of freedom, `[dofs]`: N s/m for translation, N m s/rad for rotation.
     DofDamping = dof_damping: |m| m.nv,
-    /// Armature of degrees of freedom, `[dofs]`: an inertia that is added to each, e.g. that of a motor's rotor.
+    /// Armature of degrees of freedom, `[dofs]`: an inertia that is added to each degree of freedom, e.g. the inertia
+    /// of a motor's rotor. In kg for translation, kg m² for rotation.
     DofArmature = dof_armature: |m| m.nv,
-    /// Dry friction of degrees of freedom, `[dofs]`.
+    /// Dry friction of degrees of freedom, `[dofs]`: N for translation, N m for rotation.
     DofFrictionLoss = dof_frictionloss: |m| m.nv,
-    /// Inverse inertia of degrees of freedom in the initial pose, `[dofs]`.
+    /// Inverse inertia of degrees of freedom in the initial pose, `[dofs]`: 1/kg for translation, 1/(kg m²) for
+    /// rotation.
     DofInvWeight = dof_invweight0: |m| m.nv,
-    /// Inertia of degrees of freedom in the initial pose, `[dofs]`.
+    /// Inertia of degrees of freedom in the initial pose, `[dofs]`: kg for translation, kg m² for rotation.
     DofInertia = dof_M0: |m| m.nv,
-    /// Spring stiffness of joints, `[joints]`.
+    /// Spring stiffness of joints, `[joints]`: N/m for slides, N m/rad for hinges.
     JointStiffness = jnt_stiffness: |m| m.njnt,
     /// Lower and upper limits of joints in rad or m, `[joints, 2]`.
     JointRange = jnt_range: |m| 2 * m.njnt,
@@ -295,9 +297,9 @@ macro_rules! data_arrays {
 }
 
 data_arrays! {
-    /// Generalised positions, `[n_q]`.
+    /// Generalised positions, `[n_q]`, in m and rad. Orientations of free and ball joints are unit quaternions.
     Positions = qpos: |m| m.nq,
-    /// Generalised velocities, `[n_v]`.
+    /// Generalised velocities, `[n_v]`, in m/s and rad/s.
     Velocities = qvel: |m| m.nv,
     /// Controls of actuators, `[actuators]`.
     Controls = ctrl: |m| m.nu,
@@ -313,15 +315,18 @@ data_arrays! {
     GeomPositions = geom_xpos: |m| 3 * m.ngeom,
     /// Positions of sites in m, world frame, `[sites, 3]`.
     SitePositions = site_xpos: |m| 3 * m.nsite,
-    /// Inertia and mass of each body about the centre of mass of its kinematic tree, `[bodies, 10]`.
+    /// Inertia of each body about the centre of mass of its kinematic tree, `[bodies, 10]`: six elements of the inertia
+    /// matrix in kg m², the mass times the offset in kg m, and the mass in kg.
     BodyInertias = cinert: |m| 10 * m.nbody,
-    /// Velocity of each body about the centre of mass of its kinematic tree, `[bodies, 6]`: angular, then linear.
+    /// Velocity of each body about the centre of mass of its kinematic tree, `[bodies, 6]`: angular in rad/s, then
+    /// linear in m/s.
     BodyVelocities = cvel: |m| 6 * m.nbody,
-    /// External force on each body about the centre of mass of its kinematic tree, `[bodies, 6]`: torque, then force.
+    /// External force on each body about the centre of mass of its kinematic tree, `[bodies, 6]`: torque in N m, then
+    /// force in N.
     BodyExternalForces = cfrc_ext: |m| 6 * m.nbody,
-    /// Total force of the actuators on each degree of freedom, `[dofs]`.
+    /// Total force of the actuators on each degree of freedom, `[dofs]`, in N or N m.
     DofActuation = qfrc_actuator: |m| m.nv,
-    /// Total force of the constraints on each degree of freedom, `[dofs]`.
+    /// Total force of the constraints on each degree of freedom, `[dofs]`, in N or N m.
     DofConstraint = qfrc_constraint: |m| m.nv,
     /// Force of each actuator, `[actuators]`.
     ActuatorForces = actuator_force: |m| m.nu,

@@ -48,10 +48,10 @@ pub enum LedgerEvent {
     Draws(DrawRecord),
     /// A session requested a region from which it may not draw.
     Refused {
-        /// The session.
+        /// The session that made the request.
         #[serde(flatten)]
         who: LedgerSession,
-        /// The region.
+        /// The requested region.
         region: Region,
         /// The reason of the refusal.
         reason: String,
@@ -76,7 +76,7 @@ pub struct LedgerSession {
 /// A change of the regions from which the environments of a session draw their parameters.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DrawRecord {
-    /// The session.
+    /// The session that owns the environments.
     #[serde(flatten)]
     pub who: LedgerSession,
     /// The regions from which environments begin to draw.
@@ -155,19 +155,19 @@ pub enum Error {
     /// The file cannot be read.
     #[error("cannot read {path}: {source}")]
     Io {
-        /// The file.
+        /// The path of the ledger's file.
         path: PathBuf,
-        /// The reason.
+        /// The operating system's error.
         source: io::Error,
     },
     /// A line is not valid, or does not match the lines before it.
     #[error("line {line} of {path} {what}: the file was changed after it was written, or is no ledger")]
     Broken {
-        /// The file.
+        /// The path of the ledger's file.
         path: PathBuf,
         /// The number of the line, from 1.
         line: u64,
-        /// The reason.
+        /// The fault of the line, as a part of the message, e.g. "has no digest".
         what: &'static str,
     },
 }

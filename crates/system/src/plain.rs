@@ -56,7 +56,8 @@ pub fn require_plain(metadata: &Metadata) -> Result<()> {
     }
 }
 
-/// Returns the flag `O_NONBLOCK` for opening a file. With it, opening a pipe does not wait for its other end.
+/// Returns the flag `O_NONBLOCK` for opening a file. With this flag, opening a pipe does not wait until another process
+/// opens the other end of the pipe.
 pub fn nonblocking_flag() -> i32 {
     OFlags::NONBLOCK.bits().cast_signed()
 }
