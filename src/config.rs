@@ -19,15 +19,16 @@ const ENV_PREFIX: &str = "PERTURB_SERVER";
 const MAX_SECONDS: u64 = 86_400;
 /// The minimum of `max_memory`, bytes. A server that draws pictures needs more.
 const MIN_MEMORY: usize = 1 << 20;
-/// The number of cores for each transport thread, by default. It is high because physics needs most of the cores.
+/// The number of cores for each transport thread, by default. The number is high, because physics needs most of the
+/// cores.
 const CORES_PER_TRANSPORT_THREAD: usize = 8;
 /// The maximum number of transport threads. More would not have enough to do on any machine.
 const MAX_TRANSPORT_THREADS: usize = 128;
 /// The maximum length of the configuration file, bytes.
 const MAX_CONFIG_BYTES: u64 = 1 << 20;
-/// The settings of `--private`. They remove the limits, which protect only shared servers. Timeouts are long, because
-/// the program that started the server may compute for long between two steps. If this program dies, its socket and
-/// pipe are closed without a timeout.
+/// The settings of `--private`. These settings remove the limits, which protect only shared servers. Timeouts are long,
+/// because the program that started the server may compute for long between two steps. If this program dies, its socket
+/// and pipe are closed without a timeout.
 const PRIVATE: &str = "
     exit_with_stdin = true
     transport_threads = 1

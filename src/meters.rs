@@ -1,4 +1,5 @@
-//! Counters of steps, episodes and durations. They are atomics, so counting needs neither a lock nor an allocation.
+//! Counters of steps, episodes and durations. The counters are atomics, so counting needs neither a lock nor an
+//! allocation.
 
 use std::{
     array,
@@ -76,7 +77,7 @@ impl Meter {
     }
 }
 
-/// The step counter of one batch. It also adds to the counters of all environments with the same name.
+/// The step counter of one batch. Its steps also count in the counters of all environments with the same name.
 pub struct Tally {
     /// The counters of all environments with the same name.
     pub meter: Arc<Meter>,

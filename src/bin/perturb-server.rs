@@ -157,8 +157,9 @@ fn remove_folders(config: &Config) {
     }
 }
 
-/// Loads the environments to serve: the built-in ones and those of the configured folders. Each folder is first loaded
-/// in a process of its own. If `measured`, the reports contain the speed of the folders' environments.
+/// Loads the environments to serve: the built-in environments and the environments of the configured folders. Each
+/// folder is first loaded in a separate process. If `measured`, the reports contain the speed of the folders'
+/// environments.
 #[cfg(feature = "mujoco")]
 fn environments(config: &Config, measured: bool) -> Result<Environments, Failure> {
     let mut environments = Environments { catalogue: tasks::catalogue(), folders: Vec::new(), reports: Vec::new() };

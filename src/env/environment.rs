@@ -44,7 +44,7 @@ pub struct EnvironmentSpec {
     pub state: &'static [Channel],
     /// The terms of the reward, in order. The reward is their sum.
     pub reward_terms: &'static [RewardTerm],
-    /// The physical quantities that receipts report, in order. They are read back from the simulation.
+    /// The physical quantities that receipts report, in order. Their values are read back from the simulation.
     pub applied: &'static [Quantity],
     /// The number of steps after which an episode is truncated.
     pub step_limit: u32,
@@ -187,15 +187,15 @@ pub trait Environment: Send {
         ""
     }
 
-    /// Returns the value that the episode has achieved so far. It is used only if the success rule compares
+    /// Returns the value that the episode has achieved so far. The value is used only if the success rule compares
     /// [`Achievement::Own`](super::Achievement::Own).
     fn achieved(&self) -> Option<f64> {
         None
     }
 
     /// Sets the seed, environment index and episode index that determine the episode's random numbers, and the number
-    /// of steps that the episode has taken. It is called before an episode begins or is loaded. Environments that draw
-    /// no random numbers during steps ignore this call.
+    /// of steps that the episode has taken. The method is called before an episode begins or is loaded. Environments
+    /// that draw no random numbers during steps ignore this call.
     fn set_address(&mut self, _draw: Draw, _steps: u32) {}
 
     /// Writes the action with the least effect to `out`: a vector with an entry for each channel, or the index of a

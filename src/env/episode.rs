@@ -101,8 +101,8 @@ pub(super) struct Progress {
     pub(super) reached_at: u32,
     /// The number of consecutive steps, up to the last one, after which the task's goal was met.
     pub(super) held_for: u32,
-    /// The maximal number of consecutive steps after which the task's goal was met. It is skipped here, because the
-    /// first format of snapshots lacks it. Later formats store it separately, at the end.
+    /// The maximal number of consecutive steps after which the task's goal was met. The field is skipped here, because
+    /// the first format of snapshots lacks it. Later formats store it separately, at the end.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,

@@ -1,11 +1,11 @@
 //! Random streams that are fully determined by the seed, the environment's index, a purpose, and the number of a trial,
 //! episode or step.
 //!
-//! All random numbers come from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011). It
-//! is a function of a key and a counter, without other state. The key is `[seed, environment index]`. The counter is
-//! `[block, index, purpose, 0]`, where `block` counts from 1. So numbers do not depend on earlier computations, the
-//! thread or the server. NumPy has the same layout, so a few lines of Python reproduce any stream. The arrays must have
-//! the type uint64, since lists lose digits of numbers from 2^63 on:
+//! All random numbers come from Philox 4×64-10 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", 2011).
+//! Philox is a function of a key and a counter, without other state. The key is `[seed, environment index]`. The
+//! counter is `[block, index, purpose, 0]`, where `block` counts from 1. So numbers do not depend on earlier
+//! computations, the thread or the server. NumPy has the same layout, so a few lines of Python reproduce any stream.
+//! The arrays must have the type uint64, since lists lose digits of numbers from 2^63 on:
 //!
 //! ```python
 //! key = numpy.array([seed, environment_index], dtype=numpy.uint64)
@@ -18,8 +18,8 @@
 //! | 0 | trial | for R+E first a number that selects R if it is below ½; then a number u in [0, 1) for each parameter, in the catalogue's order |
 //! | 1 | episode | the numbers of the initial state, in the order of the environment's document |
 //!
-//! Disturbances draw at each step, each step from a stream of its own. Its counter is `[block, episode, purpose,
-//! step]`:
+//! Disturbances draw numbers at each step, and each step has its own stream. The counter of a step's stream is `[block,
+//! episode, purpose, step]`:
 //!
 //! | purpose | step | draws, in order |
 //! |---|---|---|

@@ -75,8 +75,8 @@ pub struct Batch {
     runner: Option<Box<PolicyRunner>>,
     /// Runs when the environments are freed.
     drop_hook: Option<DropHook>,
-    /// Dropped when the environments have been freed; [`Batch::close`] waits for that. It must be the last field,
-    /// because fields are dropped in order.
+    /// A sender that is dropped when the environments have been freed, for which [`Batch::close`] waits. It must be the
+    /// last field, because fields are dropped in order.
     freed: Option<oneshot::Sender<()>>,
 }
 

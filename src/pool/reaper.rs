@@ -14,7 +14,7 @@ use std::{
     time::Duration,
 };
 
-/// The niceness of the thread. Its priority is low because no request waits for it.
+/// The niceness of the thread. The thread's priority is low, because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
 /// A function that frees a closed session's batch if no worker uses the batch any more. It returns whether the batch is

@@ -26,8 +26,9 @@ pub struct BatchSettings {
 pub struct SlotGroup {
     /// The number of slots, at least 1.
     pub size: usize,
-    /// The settings of the group's episodes. They determine all randomness. `environment_index` is the environment
-    /// index of the group's first slot. The next slots have the next indices; the last index must fit a u32.
+    /// The settings of the group's episodes. These settings determine all randomness. `environment_index` is the
+    /// environment index of the group's first slot. The next slots have the next indices; the last index must fit a
+    /// u32.
     pub episodes: Settings,
 }
 

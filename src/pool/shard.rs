@@ -14,7 +14,7 @@ use crate::{
 use bytes::Bytes;
 use std::sync::{Arc, Mutex};
 
-/// A command for a shard. Its slots are relative to the shard's first slot.
+/// A command for a shard. The slots in a command are relative to the shard's first slot.
 pub(super) enum Command {
     Open,
     Step,

@@ -46,7 +46,8 @@ pub(super) struct ShardOutputs<'a> {
 }
 
 impl ShardOutputs<'_> {
-    /// Gathers the result of the last step. It contains the terms of the rewards only if `reward_terms` is true.
+    /// Gathers the result of the last step. The result contains the terms of the rewards only if `reward_terms` is
+    /// true.
     pub(super) fn step_result(mut self, reward_terms: bool) -> StepResult {
         StepResult {
             observations: self.observations(),

@@ -23,8 +23,8 @@ use std::{
 use tokio::{sync::oneshot, time::Instant};
 use turns::Turns;
 
-/// Scheduling priority (niceness) of the drawing thread and of the graphics driver's threads. It is lower than that of
-/// the threads for physics.
+/// Scheduling priority (niceness) of the drawing thread and of the graphics driver's threads. The threads for physics
+/// have a higher priority.
 const NICENESS: i32 = 5;
 /// Maximal time that a server waits at shutdown for the picture being drawn.
 const SHUTDOWN_TIMEOUT: Duration = Duration::from_secs(1);
@@ -101,8 +101,8 @@ impl Renderer {
     }
 
     /// Draws a picture. Returns its pixels, `[height, width, 3]`: red, green and blue, top row first. Pictures are
-    /// drawn one at a time; small ones may overtake large ones in the queue. The same scene and size give the same
-    /// bytes.
+    /// drawn one at a time; small pictures may overtake large pictures in the queue. The same scene and size give the
+    /// same bytes.
     ///
     /// # Errors
     /// [`Error`] if the picture cannot be drawn.

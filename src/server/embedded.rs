@@ -42,7 +42,7 @@ pub enum StartError {
     Config(#[from] config::Error),
 }
 
-/// A server in this process. Its threads end when it and all its sessions have been dropped.
+/// A server in this process. The server's threads end when the server and all its sessions have been dropped.
 pub struct EmbeddedServer {
     context: Arc<ServerContext>,
     budget: Budget,

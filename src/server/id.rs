@@ -16,7 +16,7 @@ impl RequestError for NoRandomness {
     }
 }
 
-/// Returns 128 random bits from the operating system. They do not depend on any seed.
+/// Returns 128 random bits from the operating system. The bits do not depend on any seed.
 ///
 /// # Errors
 /// [`NoRandomness`], if the operating system has no random bits.

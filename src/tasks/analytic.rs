@@ -1,6 +1,6 @@
-//! Functions that the analytic tasks share. The dynamics of an analytic task are formulas, not a MuJoCo model. They are
-//! Gymnasium 1.4's formulas in f64. Sine and cosine come from the crate libm, because the C library's results differ in
-//! the last digits between processors.
+//! Functions that the analytic tasks share. The dynamics of an analytic task are formulas, not a MuJoCo model. The
+//! formulas are those of Gymnasium 1.4, computed in f64. Sine and cosine come from the crate libm, because the C
+//! library's results differ in the last digits between processors.
 
 use crate::env::{Action, Error, Stream};
 
@@ -26,8 +26,8 @@ fn observable(state: &[f64]) -> bool {
     state.iter().all(|&x| (x as f32).is_finite())
 }
 
-/// Checks a saved state and returns it. It must have exactly `N` finite numbers. The absolute value of each number must
-/// not exceed its limit in `most`.
+/// Checks a saved state and returns it. The state must have exactly `N` finite numbers. The absolute value of each
+/// number must not exceed its limit in `most`.
 pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64; N], Error> {
     match <[f64; N]>::try_from(state) {
         Ok(state) if !observable(&state) => Err(Error::Snapshot { reason: "its state is not finite".into() }),

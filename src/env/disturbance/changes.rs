@@ -32,9 +32,9 @@ impl ChangingPhysics {
         Self { environment, is_changing: false, is_changed: false, sets, applied, places, state: Vec::new() }
     }
 
-    /// Stores the normal parameters `own` and the changed parameters `values.changed`, and applies the normal ones. If
-    /// the physics can change, also reads the quantities of both sets back from the physics. The state is undefined
-    /// until the next reset.
+    /// Stores the normal parameters `own` and the changed parameters `values.changed`, and applies the normal
+    /// parameters. If the physics can change, also reads the quantities of both sets back from the physics. The state
+    /// is undefined until the next reset.
     pub(super) fn set_parameters(&mut self, own: &[f64], values: &DisturbanceValues) {
         self.is_changing = values.is_changing();
         self.is_changed = false;
@@ -110,7 +110,7 @@ impl ChangingPhysics {
     }
 }
 
-/// Whether the physics change just before step number `step`, counted from 0. They never change before step 0.
+/// Whether the physics change just before step number `step`, counted from 0. The physics never change before step 0.
 fn begins_with_change(values: &DisturbanceValues, draw: &Draw, step: u32) -> bool {
     let DisturbanceValues { change_at, change_every, change_probability, .. } = *values;
     let is_drawn =

@@ -7,7 +7,7 @@ use crate::env::{Channel, Draw, Error, Purpose, Stream};
 pub(super) struct SensorPath {
     channels: &'static [Channel],
     /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the policy sees the oldest observation now, with
-    /// noise and dropout; the newer ones are still delayed.
+    /// noise and dropout; the newer observations are still delayed.
     exact: Vec<f32>,
     /// The index in `exact` of the first number of the newest observation.
     newest: usize,

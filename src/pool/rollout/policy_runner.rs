@@ -74,8 +74,8 @@ pub(in crate::pool) struct StepBuffers {
 }
 
 impl PolicyRunner {
-    /// Starts a policy in the environments of `shards`. It continues from the policy's saved state, or begins a trial
-    /// if there is none.
+    /// Starts a policy in the environments of `shards`. The policy continues from its saved state. Without a saved
+    /// state, each environment begins a trial.
     pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =

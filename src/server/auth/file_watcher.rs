@@ -14,7 +14,7 @@ const POLL_INTERVAL: Duration = Duration::from_millis(500);
 /// The maximum length of a watched file, bytes.
 const MAX_FILE_BYTES: u64 = 1 << 20;
 
-/// The watcher of some files. Its thread ends when this and all its [reloaders](Reloader) have been dropped.
+/// The watcher of some files. Its thread ends when the watcher and all its [reloaders](Reloader) have been dropped.
 pub struct FileWatcher(Sender<()>);
 
 /// A handle that makes file watchers reload their files immediately.

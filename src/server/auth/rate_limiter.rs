@@ -8,7 +8,8 @@ use std::{
 };
 use tokio::time::{Instant, sleep};
 
-/// The maximum time, in seconds, for which an idle client saves steps that it may later run faster than the rate.
+/// The length of a burst: a client that was idle may run the steps that the rate allows in this time, in seconds, at
+/// once.
 const BURST_SECONDS: f64 = 1.0;
 /// The maximum wait. A request that would wait longer is refused, because clients wait a minute for a reply.
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);

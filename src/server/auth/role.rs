@@ -4,7 +4,7 @@ use crate::env::{EnvironmentSpec, Version, disturbance};
 use perturb_protocol::region::Region;
 use std::fmt;
 
-/// A role of tokens. It limits the parameter values that their sessions may draw.
+/// A role of tokens. A role limits the parameter values that the tokens' sessions may draw.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Role {
     pub(super) name: String,
@@ -52,7 +52,7 @@ impl Role {
     /// Checks that sessions with this role may draw from a region of an environment's parameter space.
     ///
     /// # Errors
-    /// The reason, as a part of a sentence, if they may not.
+    /// The reason, as a part of a sentence, if the sessions may not draw from the region.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
         // The sets are regions without disturbances. A session with disturbances is compared with the same sets, so it
         // cannot circumvent `never`.

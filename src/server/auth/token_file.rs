@@ -78,7 +78,7 @@ pub(super) struct ParsedToken {
     pub(super) role: Option<Arc<Role>>,
 }
 
-/// Parses and checks a token file. Its parameter sets may refer to the environments of `catalogue`.
+/// Parses and checks a token file. The file's parameter sets may refer to the environments of `catalogue`.
 pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
     let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {

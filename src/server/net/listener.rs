@@ -17,7 +17,7 @@ const MAX_PENDING_CONNECTIONS: u32 = 1024;
 pub enum Listener {
     /// A TCP port.
     Tcp(TcpListener),
-    /// A Unix socket. Its file is removed when this is dropped.
+    /// A Unix socket. The socket's file is removed when the listener is dropped.
     Unix(UnixListener, SocketFile),
 }
 
@@ -42,7 +42,8 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     }
 }
 
-/// The file of a Unix socket. It is removed when this is dropped, unless another server has replaced it.
+/// The file of a Unix socket. The file is removed when this value is dropped, unless another server has replaced the
+/// file.
 pub struct SocketFile {
     path: PathBuf,
     /// Device and inode number of the file.

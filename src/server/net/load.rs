@@ -9,8 +9,8 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The time constant with which past work is forgotten. It is as long as a learner may compute between two batches of
-/// steps, so that the thread of a computing learner does not look idle.
+/// The time constant with which past work is forgotten. This time is as long as a learner may compute between two
+/// batches of steps, so that the thread of a computing learner does not look idle.
 const WINDOW: Duration = Duration::from_secs(10);
 /// The number of bytes that cost as much work as a read or write itself.
 const BYTES_PER_UNIT: usize = 16 << 10;
@@ -39,7 +39,7 @@ impl ThreadLoad {
     }
 }
 
-/// A connection's part in the load of its thread. The thread has one connection less when this is dropped.
+/// A connection's part in the load of its thread. The thread has one connection less when this value is dropped.
 pub struct ConnectionLoad(Arc<ThreadLoad>);
 
 impl ConnectionLoad {
@@ -93,9 +93,9 @@ impl Balance {
         self.threads.iter().map(|thread| Arc::clone(&thread.load)).collect()
     }
 
-    /// Chooses the thread with the least recent work, and of equal threads the one with the fewest connections. Returns
-    /// its index, and the counter of the new connection's work. The new connection counts as average recent work at
-    /// once, so simultaneous connections are spread over the threads.
+    /// Chooses the thread with the least recent work, and among equal threads the thread with the fewest connections.
+    /// Returns the index of the thread, and the counter of the new connection's work. The new connection counts as
+    /// average recent work at once, so simultaneous connections are spread over the threads.
     pub fn choose(&mut self, now: Instant) -> (usize, ConnectionLoad) {
         self.refresh(now);
         let connections: usize = self.threads.iter().map(|thread| thread.load.connections()).sum();

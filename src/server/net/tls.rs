@@ -52,7 +52,7 @@ fn build_config(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, 
     Ok(config)
 }
 
-/// Parses the certificates of a PEM file. There must be at least one.
+/// Parses the certificates of a PEM file. The file must have at least one certificate.
 fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer<'static>>, String> {
     let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
     let all = all.map_err(|error| format!("{}: {error}; expected certificates in PEM", path.display()))?;

@@ -93,7 +93,8 @@ struct StoredReply<R> {
     response: R,
     /// The memory reservation for storing the reply. If it is `None`, the reply is dropped as soon as it is sent.
     memory: Option<MemoryReservation>,
-    /// The memory reservation that the handler made for the response. It is passed on when the response is first sent.
+    /// The memory reservation that the handler made for the response. This reservation is passed on when the response
+    /// is first sent.
     outgoing: Option<MemoryReservation>,
 }
 
@@ -103,7 +104,7 @@ enum Attachment<R> {
     Attached(ResponseSender<R>),
     /// The session has no stream. If there is a receiver, it will receive a stream whose resume request was accepted.
     Detached(Option<Resuming<R>>),
-    /// A stream has resumed the session. It continues on this runtime, and its responses go to this sender.
+    /// A stream has resumed the session. The session continues on this runtime, and its responses go to this sender.
     Resumed(Handle, ResponseSender<R>),
     /// The session has ended.
     Ended,

@@ -67,8 +67,8 @@ pub trait SessionHandler: Send + 'static {
     /// Returns the session's environment, its number of environments, and its steps so far.
     fn stats(&self) -> SessionStats;
 
-    /// The price of a request, in steps of one environment, in addition to the steps that it runs. A token's rate
-    /// limits both.
+    /// The price of a request, in steps of one environment, in addition to the steps that the request runs. A token's
+    /// rate limits the sum of price and steps.
     fn price(&self, request: &Self::Request) -> u64;
 
     /// Frees the session's resources. Resolves when they are free for other sessions.

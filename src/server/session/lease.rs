@@ -191,7 +191,7 @@ pub struct ResumingStream<R> {
     pub runtime: Handle,
 }
 
-/// A session's lease. It ends when this is dropped.
+/// A session's lease. The lease ends when the guard is dropped.
 pub struct LeaseGuard<R> {
     leases: Leases<R>,
     /// The random name with which a client resumes the session.

@@ -9,8 +9,8 @@ use tonic::codegen::http::HeaderMap;
 
 /// The HTTP header of a call that names the compression of its messages.
 const ENCODING_HEADER: &str = "grpc-encoding";
-/// The maximum number of compressed bytes that one call of `append_part` reads. It bounds the call's time even for
-/// input that decompresses to nothing.
+/// The maximum number of compressed bytes that one call of `append_part` reads. The limit bounds the call's time even
+/// for input that decompresses to nothing.
 const COMPRESSED_PART_BYTES: usize = 4 << 10;
 /// The maximum number of bytes that one call of `append_part` appends.
 const DECOMPRESSED_PART_BYTES: usize = 64 << 10;

@@ -20,8 +20,8 @@ const INLINE_DECODE_MAX_FIELDS: usize = 1000;
 const MAX_CONCURRENT_DECODES: usize = 2;
 /// The niceness of threads that decode requests, so that transport and physics take precedence.
 const DECODER_NICENESS: i32 = 5;
-/// The maximum number of entries of repeated fields whose length does not depend on the batch size. It is loose on
-/// purpose: validation enforces tighter limits with better messages.
+/// The maximum number of entries of repeated fields whose length does not depend on the batch size. The limit is loose
+/// on purpose: later validation enforces tighter limits with better messages.
 pub const MAX_REPEATED: usize = 1024;
 /// The number of bytes of a packed field that take as long to count as one unpacked field.
 const PACKED_BYTES_PER_FIELD: usize = 64;
@@ -38,7 +38,7 @@ pub struct Field {
 
 /// The type of a field's entries.
 pub enum FieldKind {
-    /// Messages. Their own fields in this list are counted, too.
+    /// Messages. The entries of those of their fields that are in this list are counted, too.
     Fields(&'static [Field]),
     /// Numbers, packed or unpacked.
     Numbers,

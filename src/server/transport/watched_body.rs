@@ -39,7 +39,8 @@ pub struct WatchedBody {
 /// The client's progress in reading replies.
 struct ReadProgress {
     state: Mutex<ProgressState>,
-    /// The task that checks the timeouts. It holds the connection, so it is aborted when the body is dropped.
+    /// The task that checks the timeouts. The task holds the connection, so the task is aborted when the body is
+    /// dropped.
     watch: OnceLock<AbortHandle>,
 }
 

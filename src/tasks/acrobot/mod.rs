@@ -99,7 +99,7 @@ impl Acrobot {
     }
 
     /// Returns the time derivative of a state (Sutton and Barto, "book" version). `torque` acts on the second joint,
-    /// `push` on the first, both in N m.
+    /// and `push` acts on the first joint. Both are in N m.
     fn derivative(&self, [theta1, theta2, dtheta1, dtheta2]: [f64; 4], torque: f64, push: f64) -> [f64; 4] {
         let (m1, m2) = (self.link_mass, self.link_mass);
         let (lc1, lc2) = (CENTRE_OF_MASS, CENTRE_OF_MASS);

@@ -60,7 +60,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
         comparison: Comparison::AtLeast,
         threshold: 195.0,
     },
-    // The paper's code compares the length with 195 after each step. It resets an ended environment before the
+    // The paper's code compares the length with 195 after each step. That code resets an ended environment before the
     // comparison, so the step that ends the episode does not count.
     code_success: Some(Success {
         description: "the episode lasted at least 196 steps",

@@ -90,17 +90,17 @@ impl Needs {
 
 /// An environment of a folder.
 ///
-/// A step sets the controls to the action, clipped to their range, and simulates `frame_skip` timesteps. Then it
-/// computes health, the terms of the reward, the observation and the achieved value, in this order, from the same
-/// state.
+/// A step sets the controls to the action, clipped to their range, and simulates `frame_skip` timesteps. Then the
+/// environment computes health, the terms of the reward, the observation and the achieved value, in this order, from
+/// the same state.
 ///
 /// The physics diverge if MuJoCo raises a warning or a fatal error, or if a reading is not finite. Examples of warnings
 /// are a bad number and dropped contacts. After a divergence the episode terminates, all terms except those of the kind
 /// `healthy` are 0, and the observation of the previous step stays. If a reset sets a state that diverges at once, the
 /// observation is all zeros.
 ///
-/// An environment has no simulation of its own. It stores its parameters and state, which are written into a shared
-/// simulation before each step, and the results of the step.
+/// An environment has no simulation of its own. Before each step, the environment's parameters and state are written
+/// into a shared simulation. After the step, the environment stores the new state and the results.
 pub(super) struct FolderEnvironment {
     task: &'static Task,
     edit: Arc<ModelEdit>,

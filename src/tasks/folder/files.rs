@@ -113,7 +113,7 @@ impl Files {
     }
 
     /// Returns a hash of all files that were read: the SHA-256, in hexadecimal, of each file's path and the SHA-256 of
-    /// its content. `task.toml` comes first, then the others by path.
+    /// its content. `task.toml` comes first, then the other files, ordered by path.
     pub(super) fn hash(&self) -> String {
         let task = self.read.get_key_value(TASK);
         let others = self.read.iter().filter(|(name, _)| *name != TASK);

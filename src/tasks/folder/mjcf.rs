@@ -12,7 +12,7 @@ use super::{
 use roxmltree::{Document, Node, ParsingOptions};
 use std::{collections::BTreeMap, fmt::Write};
 
-/// Maximal nesting depth of elements. It bounds the recursion of MuJoCo and of this module.
+/// Maximal nesting depth of elements. The limit bounds the recursion of MuJoCo and of this module.
 const MAX_DEPTH: usize = 200;
 /// Maximal total of elements, attributes and text nodes in one file.
 const MAX_NODES: u32 = 2_000_000;

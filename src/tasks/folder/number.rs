@@ -16,7 +16,7 @@ pub(super) enum Stage {
 /// A number that a task reads from a simulation, or from the action.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum Number {
-    /// Consecutive numbers of an array: (array, index of the first, count).
+    /// Consecutive numbers of an array: (array, index of the first number, count).
     Array(Array, usize, usize),
     /// The sine of the entry of `qpos` with this index.
     Sin(usize),

@@ -80,9 +80,9 @@ enum TermKind {
 /// The function by which [`TermKind::Within`] decreases with the distance from the range.
 #[derive(Debug, Clone, Copy)]
 enum MarginShape {
-    /// It decreases linearly from 1 at the range to 0 at the margin, and stays 0 beyond.
+    /// A linear decrease from 1 at the range to 0 at the margin. Beyond the margin the value is 0.
     Linear,
-    /// It decreases as exp(ln(0.1) × (distance / margin)²), like dm_control's `tolerance`. The value is 0.1 at the
+    /// The function exp(ln(0.1) × (distance / margin)²), as in dm_control's `tolerance`. The value is 0.1 at the
     /// margin.
     Gaussian,
 }

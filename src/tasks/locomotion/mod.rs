@@ -32,7 +32,7 @@ pub(super) struct Robot {
     pub look: Look,
     pub names: Names,
     pub alive: fn(&Posture<'_>) -> bool,
-    /// The compiled model. It is compiled once in the process, when it is first needed.
+    /// The compiled model. The model is compiled once in the process, when an environment first needs it.
     pub pristine: OnceLock<Result<Pristine, Error>>,
 }
 

@@ -79,8 +79,8 @@ impl EditedElements {
         model.body_mass()[self.torso_body]
     }
 
-    /// Returns the torso's density in a model, in kg/m³. It is computed from the torso's mass in `model` and its mass
-    /// in `pristine`, the compiled model.
+    /// Returns the torso's density in a model, in kg/m³. The density is computed from the torso's mass in `model` and
+    /// its mass in `pristine`, the compiled model.
     pub(super) fn density(self, model: &Model, pristine: &Model) -> f64 {
         self.torso_mass(model) / (self.torso_mass(pristine) / COMPILED_DENSITY)
     }

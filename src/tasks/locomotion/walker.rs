@@ -46,11 +46,11 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 /// where a is the action as received, not clipped, and q̇ the joints' speeds after the step in rad/s.
 ///
 /// The physics diverge if MuJoCo raises a warning or a fatal error. Examples of warnings are a bad number and dropped
-/// contacts. After a divergence the episode terminates, the term `alive` is -1 and the others are 0, and the
+/// contacts. After a divergence the episode terminates, the term `alive` is -1, the other terms are 0, and the
 /// observation of the previous step stays. If a reset sets a state that diverges at once, the observation is all zeros.
 ///
-/// A walker has no simulation of its own. It stores its parameters and state, which are written into a shared
-/// simulation before each step, and the results of the step.
+/// A walker has no simulation of its own. Before each step, the walker's parameters and state are written into a shared
+/// simulation. After the step, the walker stores the new state and the results.
 pub struct Walker {
     robot: &'static Robot,
     pristine: &'static Pristine,

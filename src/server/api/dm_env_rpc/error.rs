@@ -33,7 +33,7 @@ pub enum Error {
     /// The operating system has no random bits for a world's name.
     #[error(transparent)]
     NoRandomness(#[from] NoRandomness),
-    /// A world, a setting, an observation or the like is unknown.
+    /// The name of a world, a setting, an observation or another thing is unknown.
     #[error("{what} {name} is unknown; {known}")]
     Unknown {
         /// The kind of thing: a world, a setting, an action, …

@@ -27,7 +27,7 @@ pub struct DmEnvRpcService {
 }
 
 impl DmEnvRpcService {
-    /// Makes the service. It has no worlds yet. It records draws in `ledger`, if there is one.
+    /// Makes the service. The service has no worlds yet, and records draws in `ledger`, if there is one.
     pub fn new(pool: Arc<Pool>, catalogue: Arc<Catalogue>, sessions: Sessions, ledger: Option<Ledger>) -> Self {
         Self {
             worlds: Arc::new(Worlds::new(pool, catalogue, ledger)),

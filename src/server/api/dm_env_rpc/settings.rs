@@ -30,10 +30,11 @@ pub(super) struct Ownership {
     pub(super) shared: bool,
 }
 
-/// Changes that a reset or a write to a property makes. They take effect when the next episode begins.
+/// Changes that a reset or a write to a property makes. The changes take effect when the next episode begins.
 #[derive(Default)]
 pub(super) struct WorldChange {
-    /// The new version. It sets the distributions of all parameters; `parameters` then overrides some of them.
+    /// The new version. The version sets the distributions of all parameters; `parameters` then overrides some of these
+    /// distributions.
     pub(super) version: Option<Version>,
     /// The new seed. It restarts the counts of episodes and trials at 0.
     pub(super) seed: Option<u64>,

@@ -17,7 +17,8 @@ const MAX_HIDDEN_LAYERS: usize = 8;
 const MAX_LAYER_WIDTH: u32 = 1024;
 /// The maximum number of activations of a policy, summed over all environments.
 const MAX_ACTIVATIONS: usize = 1 << 25;
-/// The maximum computing time of the steps in one reply, µs. It bounds how long clients wait for an answer.
+/// The maximum computing time of the steps in one reply, µs. The limit bounds the time that a client waits for an
+/// answer.
 const MAX_REPLY_COST_US: f64 = 1e6;
 /// The estimated number of a policy's weights that a processor evaluates per microsecond.
 const WEIGHTS_PER_US: f64 = 5000.0;

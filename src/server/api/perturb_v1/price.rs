@@ -2,7 +2,8 @@
 
 use crate::{pool::Batch, proto::session_request::Request};
 
-/// The price of `open` without the price of its environments. It covers the session's buffers and its line in the log.
+/// The price of `open` without the price of its environments. This price covers the session's buffers and its line in
+/// the log.
 const OPEN_PRICE: u64 = 16;
 /// The price of each restored environment.
 const RESTORED_PRICE: u64 = 4;

@@ -1,4 +1,4 @@
-//! Upper bounds and estimates of the lengths of requests and replies. They are reserved in the memory budget
+//! Upper bounds and estimates of the lengths of requests and replies. So many bytes are reserved in the memory budget
 //! beforehand.
 
 use crate::{
