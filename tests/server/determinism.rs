@@ -1,4 +1,4 @@
-//! The same session gives the same bytes, whatever the number of threads, the transport, or the split of the batch.
+//! A session gives the same bytes for every number of threads, every transport, and every split of the batch.
 
 use crate::common::server::{Actor, Server, Session, catalogue, open, stepped};
 use perturb::proto::{EpisodeEnd, EpisodeStart, Open, Reset, SessionResponse, Stepped, session_response::Response};

@@ -19,7 +19,7 @@ const TRAJECTORY_STEPS: usize = 50;
 /// The tolerance of rounding to f32: half an ulp on each side. It is relative, or absolute for numbers below 1.
 const OBSERVATION: f64 = 1.2e-7;
 
-/// One recorded trajectory.
+/// A recorded trajectory.
 struct Case {
     name: String,
     environment: String,

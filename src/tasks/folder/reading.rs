@@ -79,7 +79,7 @@ impl Reading {
         Ok(Self { numbers: join(numbers), entries, scale, clip })
     }
 
-    /// How many numbers the reading has.
+    /// The number of numbers that the reading has.
     pub(super) fn len(&self) -> usize {
         self.entries.len()
     }
