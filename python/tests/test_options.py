@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from typing import Any
@@ -240,6 +241,18 @@ def test_long_snapshots_are_followed_by_the_same_bytes(
     assert envs.snapshot(~odd) != saved[::2]
     with pytest.raises(perturb.InvalidArgumentError):
         envs.restore(saved[:-1])
+    envs.close()
+
+
+def test_a_restore_whose_later_part_is_refused_is_remembered(server: str) -> None:
+    """A long restore is sent in several requests. If a later one is refused, the earlier ones were done."""
+    envs = make_vec("Hopper", num_envs=8192, server=server)
+    envs.reset(seed=3)
+    saved = envs.snapshot()
+    with pytest.raises(perturb.InvalidArgumentError):
+        envs.restore([*saved[:-1], b"no snapshot"])
+    with pytest.raises(perturb.OutOfOrderError, match="after a snapshot was restored"):
+        copy.deepcopy(envs)
     envs.close()
 
 

@@ -13,7 +13,9 @@
 // The list above links to private modules for readers of this crate. Nothing is public, because only Python uses it.
 #![allow(rustdoc::private_intra_doc_links)]
 
+use numpy::{PyArray1, PyArrayMethods};
 use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyDict, PyInt};
 
 mod arrays;
 mod assessed;
@@ -62,4 +64,24 @@ mod _native {
     /// Maximum number of contexts in a set.
     #[pymodule_export]
     const MAX_CONTEXTS: usize = perturb_settings::sets::MAX_CONTEXTS;
+
+    /// Runs when Python imports the module.
+    #[pymodule_init]
+    fn initialise(module: &pyo3::Bound<'_, pyo3::types::PyModule>) -> pyo3::PyResult<()> {
+        super::initialise_once_locks(module.py())
+    }
+}
+
+/// Initialises the static values of PyO3 and NumPy that requests use. They would otherwise be initialised by the first
+/// request. If another thread forked the process during that time, the forked process would wait forever for the end of
+/// the initialisation.
+fn initialise_once_locks(py: Python<'_>) -> PyResult<()> {
+    let array = PyArray1::from_slice(py, &[0_f32]);
+    array.try_readonly()?;
+    requests::is_integer(&array);
+    for object in [array.as_any(), PyDict::new(py).as_any(), PyBytes::new(py, b"").as_any()] {
+        let wrong_type = object.cast::<PyInt>().err().map(PyErr::from);
+        wrong_type.iter().for_each(|error| drop(error.to_string()));
+    }
+    Ok(())
 }

@@ -108,7 +108,7 @@ impl Actions {
 }
 
 /// Whether the action is an integer of Python or NumPy. Returns false for a bool.
-fn is_integer(action: &Bound<'_, PyAny>) -> bool {
+pub fn is_integer(action: &Bound<'_, PyAny>) -> bool {
     static NUMPY_INTEGER: PyOnceLock<Py<PyType>> = PyOnceLock::new();
     action.is_exact_instance_of::<PyInt>()
         || NUMPY_INTEGER

@@ -251,13 +251,10 @@ class Client:
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session
         try:
-            restored = session.restore(_bytes(mask), snapshots)
-        except BaseException:
-            # If the session is still usable, the server refused the request and changed nothing.
-            self._was_restored = self._was_restored or not session.usable()
-            raise
-        self._was_restored = True  # from now on only the server knows the parameters
-        return restored
+            return session.restore(_bytes(mask), snapshots)
+        finally:
+            # If the session was lost during the restore, the server may have restored the snapshots.
+            self._was_restored = self._was_restored or session.restored() or not session.usable()
 
     def render(self, slot: int) -> NDArray[np.uint8]:
         """Draw the environment in a slot of the batch. Return a picture, uint8 [height, width, 3]."""

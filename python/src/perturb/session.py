@@ -215,6 +215,10 @@ class Session:
         """
         return self._call("restore", self._native.restore, mask, snapshots)
 
+    def restored(self) -> bool:
+        """Whether the server restored a snapshot in this session. Then only the server knows the parameters."""
+        return self._native.restored
+
     def render(self, slot: int, width: int, height: int) -> NDArray[np.uint8]:
         """Draw the environment in a slot. Return a picture, uint8 [height, width, 3]."""
         return self._call("render", self._native.render, slot, width, height)

@@ -2,11 +2,11 @@
 /// An array in row-major order.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Tensor {
-    /// The length of each dimension; empty for a scalar. One length may be negative: it is inferred from the number of
-    /// elements.
+    /// The length of each dimension; empty for a scalar. One length may be negative, and is then inferred from the
+    /// number of elements.
     #[prost(int32, repeated, tag = "15")]
     pub shape: ::prost::alloc::vec::Vec<i32>,
-    /// The elements. If there is only one, all elements of the shape have its value.
+    /// The elements. A single element is repeated to fill the shape.
     #[prost(oneof = "tensor::Payload", tags = "1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11")]
     pub payload: ::core::option::Option<tensor::Payload>,
 }
@@ -89,40 +89,40 @@ pub mod tensor {
         #[prost(message, repeated, tag = "1")]
         pub array: ::prost::alloc::vec::Vec<::prost_types::Any>,
     }
-    /// The elements. If there is only one, all elements of the shape have its value.
+    /// The elements. A single element is repeated to fill the shape.
     #[derive(Clone, PartialEq, ::prost::Oneof)]
     pub enum Payload {
-        /// FLOAT
+        /// The elements of a FLOAT tensor.
         #[prost(message, tag = "1")]
         Floats(FloatArray),
-        /// DOUBLE
+        /// The elements of a DOUBLE tensor.
         #[prost(message, tag = "2")]
         Doubles(DoubleArray),
-        /// INT8
+        /// The elements of an INT8 tensor.
         #[prost(message, tag = "3")]
         Int8s(Int8Array),
-        /// INT32
+        /// The elements of an INT32 tensor.
         #[prost(message, tag = "4")]
         Int32s(Int32Array),
-        /// INT64
+        /// The elements of an INT64 tensor.
         #[prost(message, tag = "5")]
         Int64s(Int64Array),
-        /// UINT8
+        /// The elements of a UINT8 tensor.
         #[prost(message, tag = "6")]
         Uint8s(Uint8Array),
-        /// UINT32
+        /// The elements of a UINT32 tensor.
         #[prost(message, tag = "7")]
         Uint32s(Uint32Array),
-        /// UINT64
+        /// The elements of a UINT64 tensor.
         #[prost(message, tag = "8")]
         Uint64s(Uint64Array),
-        /// BOOL
+        /// The elements of a BOOL tensor.
         #[prost(message, tag = "9")]
         Bools(BoolArray),
-        /// STRING
+        /// The elements of a STRING tensor.
         #[prost(message, tag = "10")]
         Strings(StringArray),
-        /// PROTO
+        /// The elements of a PROTO tensor.
         #[prost(message, tag = "11")]
         Protos(ProtoArray),
     }
@@ -160,28 +160,28 @@ pub mod tensor_spec {
         /// The bound, of the type `dtype`.
         #[derive(Clone, PartialEq, ::prost::Oneof)]
         pub enum Payload {
-            /// FLOAT
+            /// The bound of a FLOAT tensor.
             #[prost(message, tag = "9")]
             Floats(super::super::tensor::FloatArray),
-            /// DOUBLE
+            /// The bound of a DOUBLE tensor.
             #[prost(message, tag = "10")]
             Doubles(super::super::tensor::DoubleArray),
-            /// INT8
+            /// The bound of an INT8 tensor.
             #[prost(message, tag = "11")]
             Int8s(super::super::tensor::Int8Array),
-            /// INT32
+            /// The bound of an INT32 tensor.
             #[prost(message, tag = "12")]
             Int32s(super::super::tensor::Int32Array),
-            /// INT64
+            /// The bound of an INT64 tensor.
             #[prost(message, tag = "13")]
             Int64s(super::super::tensor::Int64Array),
-            /// UINT8
+            /// The bound of a UINT8 tensor.
             #[prost(message, tag = "14")]
             Uint8s(super::super::tensor::Uint8Array),
-            /// UINT32
+            /// The bound of a UINT32 tensor.
             #[prost(message, tag = "15")]
             Uint32s(super::super::tensor::Uint32Array),
-            /// UINT64
+            /// The bound of a UINT64 tensor.
             #[prost(message, tag = "16")]
             Uint64s(super::super::tensor::Uint64Array),
         }
@@ -190,7 +190,7 @@ pub mod tensor_spec {
 /// Creates a world.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct CreateWorldRequest {
-    /// The setting `env_id`, and settings that differ from their defaults.
+    /// The settings of the world. `env_id` names the environment and is required. All other settings have defaults.
     #[prost(btree_map = "string, message", tag = "1")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -214,14 +214,14 @@ pub struct ActionObservationSpecs {
     #[prost(btree_map = "uint64, message", tag = "2")]
     pub observations: ::prost::alloc::collections::BTreeMap<u64, TensorSpec>,
 }
-/// Makes the stream the agent of a world. A world has at most one agent at a time, and a stream is the agent of at most
-/// one world.
+/// Joins a world: the stream becomes the world's agent, which steps the environment. A world has at most one agent at a
+/// time, and a stream is the agent of at most one world.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct JoinWorldRequest {
     /// The name of the world.
     #[prost(string, tag = "1")]
     pub world_name: ::prost::alloc::string::String,
-    /// Must be empty: there are no settings.
+    /// Must be empty, because joining has no settings.
     #[prost(btree_map = "string, message", tag = "2")]
     pub settings: ::prost::alloc::collections::BTreeMap<
         ::prost::alloc::string::String,
@@ -273,8 +273,8 @@ pub struct ResetResponse {
     #[prost(message, optional, tag = "1")]
     pub specs: ::core::option::Option<ActionObservationSpecs>,
 }
-/// Resets any world. If another stream is its agent, that agent's next step is carried out, and ends its episode with
-/// INTERRUPTED. The response does not wait for this step.
+/// Resets a world, even if another stream is its agent. The other agent's next step is then still carried out, and ends
+/// the episode with INTERRUPTED. The response does not wait for this step.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ResetWorldRequest {
     /// The name of the world.
@@ -394,17 +394,17 @@ pub enum DataType {
     Float = 1,
     /// 64-bit floating point.
     Double = 2,
-    /// 8-bit signed.
+    /// 8-bit signed integer.
     Int8 = 3,
-    /// 32-bit signed.
+    /// 32-bit signed integer.
     Int32 = 4,
-    /// 64-bit signed.
+    /// 64-bit signed integer.
     Int64 = 5,
-    /// 8-bit unsigned.
+    /// 8-bit unsigned integer.
     Uint8 = 6,
-    /// 32-bit unsigned.
+    /// 32-bit unsigned integer.
     Uint32 = 7,
-    /// 64-bit unsigned.
+    /// 64-bit unsigned integer.
     Uint64 = 8,
     /// Booleans.
     Bool = 9,
@@ -453,7 +453,7 @@ impl DataType {
         }
     }
 }
-/// The state of an agent's sequence, which is an episode.
+/// The state of an agent's episode, which dm_env_rpc calls a sequence.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum EnvironmentStateType {
@@ -461,7 +461,8 @@ pub enum EnvironmentStateType {
     InvalidEnvironmentState = 0,
     /// The episode continues.
     Running = 1,
-    /// The task ended the episode. The next step ignores its actions and begins the next episode.
+    /// The environment, e.g. by a fall or a goal, ended the episode. The next step ignores its actions and begins the next
+    /// episode.
     Terminated = 2,
     /// The step limit or a reset of the world ended the episode. The next step ignores its actions and begins the next
     /// episode.
@@ -572,9 +573,9 @@ pub mod environment_client {
             self.inner = self.inner.max_encoding_message_size(limit);
             self
         }
-        /// Every request gets exactly one response, in order: the variant of the same name, or `error`. After an `error`
-        /// nothing has changed, and the stream continues. Requests may be sent without waiting for earlier responses. The
-        /// stream ends with a status in the same cases as a session of perturb.v1.
+        /// Every request gets exactly one response, in order. The response is `error`, or has the same name as the request,
+        /// e.g. `step`. A request that gets an `error` changes nothing, and the stream continues. Requests may be sent without
+        /// waiting for earlier responses. The stream ends with a status in the same cases as a session of perturb.v1.
         pub async fn process(
             &mut self,
             request: impl tonic::IntoStreamingRequest<
@@ -622,9 +623,9 @@ pub mod environment_server {
             >
             + std::marker::Send
             + 'static;
-        /// Every request gets exactly one response, in order: the variant of the same name, or `error`. After an `error`
-        /// nothing has changed, and the stream continues. Requests may be sent without waiting for earlier responses. The
-        /// stream ends with a status in the same cases as a session of perturb.v1.
+        /// Every request gets exactly one response, in order. The response is `error`, or has the same name as the request,
+        /// e.g. `step`. A request that gets an `error` changes nothing, and the stream continues. Requests may be sent without
+        /// waiting for earlier responses. The stream ends with a status in the same cases as a session of perturb.v1.
         async fn process(
             &self,
             request: tonic::Request<tonic::Streaming<super::EnvironmentRequest>>,

@@ -23,7 +23,7 @@ pub struct ListEnvironmentsResponse {
 /// The description of an environment.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Environment {
-    /// The name by which clients open it, e.g. "CartPole".
+    /// The name by which clients open the environment, e.g. "CartPole".
     #[prost(string, tag = "1")]
     pub name: ::prost::alloc::string::String,
     /// The revision, the N of "perturb/CartPole-vN". Every change of dynamics, reward or observation raises it.
@@ -76,16 +76,16 @@ pub struct Environment {
     /// Disturbances: parameters such as the delay of actions, which a client may name wherever it may name parameters. If
     /// an `open` names a disturbance, all disturbances are appended to the session's `parameters`, in this order. A
     /// quantity of the same name for each is appended to `applied`, and an entry for each to `parameter_observations`. All
-    /// versions draw the default values, which have no effect. The exceptions are disturbances named `changed_` and a
-    /// parameter's name: the versions draw them like the parameter. They hold after a change of the physics, which by
-    /// default never happens. Empty from older servers.
+    /// versions draw the default values, which have no effect. The exceptions are disturbances whose names are `changed_`
+    /// followed by a parameter's name. They are the parameter's values after a change of the physics within an episode,
+    /// and a version draws them like the parameter. By default the physics never change. Empty from older servers.
     #[prost(message, repeated, tag = "17")]
     pub disturbances: ::prost::alloc::vec::Vec<Parameter>,
 }
 /// The scaling of an observed parameter, computed in float64 and rounded to float32:
 ///    entry = 2 (value - at_minus_one) / (at_plus_one - at_minus_one) - 1
-/// or value - at_minus_one if the two are equal. Nothing is clipped. `value` is read back from the physics as in a
-/// receipt: `Receipt.applied` of the quantity `Parameter.applied`.
+/// If at_plus_one = at_minus_one, the entry is value - at_minus_one. Entries are not clipped. `value` is read back from
+/// the physics as in a receipt: it is the entry of `Receipt.applied` for the quantity `Parameter.applied`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct ParameterObservation {
     /// The appended entry: its name, and its range if the parameter is within its bounds. It is dimensionless.
@@ -130,10 +130,10 @@ pub struct Parameter {
     /// The value in version D.
     #[prost(double, tag = "4")]
     pub default_value: f64,
-    /// The minimum that the server accepts.
+    /// The minimum value that the server accepts, in `unit`.
     #[prost(double, tag = "5")]
     pub low: f64,
-    /// The maximum that the server accepts.
+    /// The maximum value that the server accepts, in `unit`.
     #[prost(double, tag = "6")]
     pub high: f64,
     /// The distribution of version R.
@@ -142,12 +142,12 @@ pub struct Parameter {
     /// The distribution of version E.
     #[prost(message, optional, tag = "8")]
     pub extreme: ::core::option::Option<Distribution>,
-    /// The name of the quantity in `Environment.applied` that reads this parameter back from the physics, in the same
-    /// unit. In a receipt, its value equals the requested value up to rounding.
+    /// The name of the quantity in `Environment.applied` that has this parameter's value as read back from the physics, in
+    /// the same unit. In a receipt, this quantity equals the parameter's requested value up to rounding.
     #[prost(string, tag = "9")]
     pub applied: ::prost::alloc::string::String,
-    /// Whether its values are whole numbers. Then a distribution draws each whole number in its intervals with equal
-    /// probability, and each interval must contain one.
+    /// Whether the parameter's values are whole numbers. If so, a distribution draws each whole number in its intervals
+    /// with equal probability, and each interval must contain a whole number.
     #[prost(bool, tag = "10")]
     pub integer: bool,
 }
@@ -248,7 +248,8 @@ pub struct Interval {
     #[prost(double, tag = "2")]
     pub high: f64,
 }
-/// A request of a session. The first must be `open` or `resume`. Later requests may be any of the others, in any order.
+/// A request of a session. The first request of a stream must be `open` or `resume`. All later requests must be of other
+/// kinds, in any order.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct SessionRequest {
     /// The request.
@@ -284,10 +285,10 @@ pub mod session_request {
         /// Lets the server play the environments with a policy.
         #[prost(message, tag = "8")]
         Act(super::Act),
-        /// Saves the player's state and statistics.
+        /// Returns the state and the running statistics of the policy that the server plays.
         #[prost(message, tag = "9")]
         SavePlayer(super::SavePlayer),
-        /// Resumes a session with a lease whose stream was lost.
+        /// Resumes a session that has a lease, after its stream was lost.
         #[prost(message, tag = "10")]
         Resume(super::Resume),
     }
@@ -359,16 +360,16 @@ pub struct Error {
 /// Creates N environments, and begins their first episodes. A session can be opened only once.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Open {
-    /// A name in the catalogue, in any spelling: case, `-` and `_` are ignored. Or a Gymnasium id such as
-    /// `perturb/CartPole-v1`, whose revision must be the catalogue's. The response has the name as in the catalogue.
+    /// The name of the environment in the catalogue; case, `-` and `_` are ignored. It may also be a Gymnasium id such as
+    /// `perturb/CartPole-v1`, whose revision must equal the catalogue's. The response has the name as in the catalogue.
     #[prost(string, tag = "1")]
     pub environment: ::prost::alloc::string::String,
     /// The version whose distributions parameters are drawn from.
     #[prost(enumeration = "Version", tag = "2")]
     pub version: i32,
-    /// Distributions by parameter name. They replace the distributions of the version; the other parameters keep those. If
-    /// a name here or in a group is that of a disturbance, all environments of the session have the disturbances as
-    /// parameters, see `Environment.disturbances`.
+    /// Distributions by parameter name. They replace the version's distributions of these parameters. If this map or a
+    /// group names a disturbance, all environments of the session have the disturbances as parameters, see
+    /// `Environment.disturbances`.
     #[prost(map = "string, message", tag = "3")]
     pub parameters: ::std::collections::HashMap<
         ::prost::alloc::string::String,
@@ -380,25 +381,27 @@ pub struct Open {
     /// The seed, any value. Together with an environment's index it determines all random numbers.
     #[prost(uint64, tag = "5")]
     pub seed: u64,
-    /// The index of the session's first environment; the other indices follow it. A batch that is split over several
-    /// sessions or servers gives the same bytes as the whole batch if each part has its offset in the batch here. The last
-    /// index must be below 2^32.
+    /// The index of the session's first environment; the following environments have the following indices. To split a
+    /// batch over several sessions or servers, set it to each part's offset in the batch. Then all parts together give
+    /// the same bytes as one session with the whole batch. The last index must be below 2^32.
     #[prost(uint32, tag = "6")]
     pub first_environment_index: u32,
-    /// The number of episodes in a trial; 0 means 1. Parameters are drawn when a trial begins, and kept for its episodes.
+    /// The number of episodes in a trial; 0 means 1. Parameters are drawn when a trial begins, and all its episodes have
+    /// these parameters.
     #[prost(uint32, tag = "7")]
     pub episodes_per_trial: u32,
     /// What happens to environments whose episode has ended.
     #[prost(enumeration = "AutoresetMode", tag = "8")]
     pub autoreset_mode: i32,
-    /// Whether replies have a receipt, the parameters of the physics, for each episode that begins or ends.
+    /// Whether replies have a `Receipt` for each episode that begins or ends. It contains the parameters of the episode's
+    /// physics.
     #[prost(bool, tag = "9")]
     pub receipts: bool,
     /// Whether replies to steps have the terms of the reward, in `Stepped.reward_terms`.
     #[prost(bool, tag = "10")]
     pub reward_terms: bool,
     /// Groups of consecutive environments, each with its own settings. They replace `version`, `parameters`, `batch_size`,
-    /// `seed`, `first_environment_index` and `episodes_per_trial`, which must then be empty. The environments of a group
+    /// `seed`, `first_environment_index` and `episodes_per_trial`, which must then not be set. The environments of a group
     /// give the same bytes as in a session of their own.
     #[prost(message, repeated, tag = "11")]
     pub groups: ::prost::alloc::vec::Vec<SlotGroup>,
@@ -407,14 +410,14 @@ pub struct Open {
     #[prost(bool, tag = "12")]
     pub observe_parameters: bool,
     /// Whether replies to steps have receipts as arrays, in `Stepped.receipt_episodes` and `Stepped.receipt_values`. For a
-    /// large batch, arrays cost a fraction of the messages. Requires `receipts`. `EpisodeEnd.receipt` and
-    /// `Stepped.started` are then empty, and episodes that end in an `act` have no receipts.
+    /// large batch, arrays take much less time than a message for each receipt. Requires `receipts`. `EpisodeEnd.receipt`
+    /// and `Stepped.started` are then empty, and episodes that end in an `act` have no receipts.
     #[prost(bool, tag = "13")]
     pub receipt_arrays: bool,
-    /// The maximal number W of requests without a received reply, 1 … 64, in a session with a lease. 0 means no lease.
-    /// With a lease, the session survives the loss of its stream for `Opened.lease_seconds`, and a new stream may resume
-    /// it (`Resume`). The server stores the last W replies. By sending a request, the client confirms that it has received
-    /// all replies except the last W - 1.
+    /// W, 1 … 64, for a session with a lease, or 0 for a session without a lease. With a lease, the session survives the
+    /// loss of its stream for `Opened.lease_seconds`, and a new stream may resume it (`Resume`). W is the maximal number
+    /// of requests whose replies the client has not received yet. The server stores the last W replies. By sending a
+    /// request, the client confirms that it has received all replies except the last W - 1.
     #[prost(uint32, tag = "14")]
     pub lease: u32,
 }
@@ -427,7 +430,7 @@ pub struct SlotGroup {
     /// The version whose distributions parameters are drawn from.
     #[prost(enumeration = "Version", tag = "2")]
     pub version: i32,
-    /// Distributions by parameter name. They replace the distributions of the version; the other parameters keep those.
+    /// Distributions by parameter name. They replace the version's distributions of these parameters.
     #[prost(map = "string, message", tag = "3")]
     pub parameters: ::std::collections::HashMap<
         ::prost::alloc::string::String,
@@ -436,7 +439,7 @@ pub struct SlotGroup {
     /// The seed, any value. Together with an environment's index it determines all random numbers.
     #[prost(uint64, tag = "4")]
     pub seed: u64,
-    /// The index of the group's first environment; the other indices follow it.
+    /// The index of the group's first environment; the following environments have the following indices.
     #[prost(uint32, tag = "5")]
     pub first_environment_index: u32,
     /// The number of episodes in a trial; 0 means 1.
@@ -481,18 +484,19 @@ pub struct Opened {
     /// in which all N episodes end. A client's limit on received messages should be at least this. 0 from older servers.
     #[prost(uint64, tag = "10")]
     pub max_step_reply_bytes: u64,
-    /// Upper bound of the size of a reply to `snapshot` of all N environments, in bytes. It holds unless a later request
-    /// sets a distribution with more intervals; each additional interval adds 16 bytes. 0 from older servers.
+    /// Upper bound of the size of a reply to `snapshot` of all N environments, in bytes. If a later request replaces a
+    /// distribution by one with more intervals, each additional interval adds 16 bytes. 0 from older servers.
     #[prost(uint64, tag = "11")]
     pub max_snapshot_reply_bytes: u64,
 }
 /// Resumes a session with a lease, as the first request of a new stream. If the server has not noticed the loss of the
 /// old stream yet, the old stream ends with ABORTED. The session is unchanged; requests that the server has read
-/// completely are carried out. An error changes nothing. The errors are: NOT_FOUND if there is no such lease, or it or
-/// its session has ended; PERMISSION_DENIED if the bearer token is not that of `open`; OUT_OF_RANGE if no reply has the
-/// number `last_reply` yet; FAILED_PRECONDITION if replies after `last_reply` are not stored any more, because a request
-/// confirmed them, or because the server had no memory for them. After an error the stream may continue with `open`,
-/// unless a full server ends it. A server that is shutting down resumes no session (UNAVAILABLE).
+/// completely are carried out. An error changes nothing. The errors are: NOT_FOUND if there is no such lease, or if the
+/// lease or its session has ended; PERMISSION_DENIED if the bearer token differs from the token of `open`; OUT_OF_RANGE
+/// if no reply has the number `last_reply` yet; FAILED_PRECONDITION if replies after `last_reply` are not stored any
+/// more, because a request confirmed them, or because the server had no memory for them. After an error the stream may
+/// continue with `open`, unless the server is full and ends the stream. A server that is shutting down resumes no
+/// session (UNAVAILABLE).
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Resume {
     /// The name of the lease, `Opened.lease`.
@@ -503,8 +507,8 @@ pub struct Resume {
     #[prost(uint64, tag = "2")]
     pub last_reply: u64,
 }
-/// The session continues in this stream. Responses with the numbers from `Resume.last_reply` + 1 to `last_reply` follow,
-/// then those to new requests.
+/// The session continues in this stream. The stored responses with the numbers from `Resume.last_reply` + 1 to
+/// `last_reply` follow, and then the responses to new requests.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Resumed {
     /// The number of the server's last reply. Requests whose replies would have higher numbers did not arrive: they have
@@ -528,7 +532,7 @@ pub struct Stepped {
     /// float32 \[N\]: rewards.
     #[prost(bytes = "bytes", tag = "2")]
     pub rewards: ::prost::bytes::Bytes,
-    /// uint8 \[N\]: 1 where the task ended the episode.
+    /// uint8 \[N\]: 1 where the environment, e.g. by a fall or a goal, ended the episode.
     #[prost(bytes = "bytes", tag = "3")]
     pub terminated: ::prost::bytes::Bytes,
     /// uint8 \[N\]: 1 where the step limit ended the episode. Both flags may be set.
@@ -547,13 +551,14 @@ pub struct Stepped {
     /// float32 \[N, number of terms\]: the terms of the rewards, if requested at `open`.
     #[prost(bytes = "bytes", tag = "8")]
     pub reward_terms: ::prost::bytes::Bytes,
-    /// uint64 \[K + B, 5\], with `receipt_arrays`: slot, environment_index, trial_index, episode_index, episode_in_trial of
-    /// each of the K episodes that ended, in the order of `ended`, then of each of the B episodes that began by autoreset,
-    /// in order of slots.
+    /// uint64 \[K + B, 5\], only with `receipt_arrays`: a row for each of the K episodes that ended, in the order of
+    /// `ended`, and then a row for each of the B episodes that began by autoreset, in order of slots. The columns are
+    /// slot, environment_index, trial_index, episode_index and episode_in_trial.
     #[prost(bytes = "bytes", tag = "9")]
     pub receipt_episodes: ::prost::bytes::Bytes,
-    /// float64 \[K + B, length of `requested` + length of `applied`\], with `receipt_arrays`: `Receipt.requested`, then
-    /// `Receipt.applied` of the same episodes. The model's hash is that of `Opened.environment`.
+    /// float64 \[K + B, length of `requested` + length of `applied`\], only with `receipt_arrays`: in each row
+    /// `Receipt.requested` and then `Receipt.applied` of the episode in the same row of `receipt_episodes`. The model hash
+    /// of all receipts is `Opened.environment.model_hash`.
     #[prost(bytes = "bytes", tag = "10")]
     pub receipt_values: ::prost::bytes::Bytes,
 }
@@ -565,7 +570,7 @@ pub struct Reset {
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
     /// Empty, or M seeds for the selected environments, in order. A seed sets the environment's episode and trial numbers
-    /// to 0; its index stays.
+    /// to 0. The environment's index does not change.
     #[prost(uint64, repeated, tag = "2")]
     pub seeds: ::prost::alloc::vec::Vec<u64>,
     /// Distributions by parameter name. They replace the distributions of the selected environments, also for later
@@ -617,7 +622,7 @@ pub struct EpisodeEnd {
     /// The number of steps.
     #[prost(uint32, tag = "4")]
     pub length: u32,
-    /// Whether the episode was a success by `Environment.success`. Without `achieved` it was not.
+    /// Whether the episode was a success by the rule `Environment.success`. An episode without `achieved` is no success.
     #[prost(bool, tag = "5")]
     pub success: bool,
     /// Whether the physics diverged, i.e. the state was no longer finite. Such an episode is terminated.
@@ -626,18 +631,19 @@ pub struct EpisodeEnd {
     /// The receipt, if requested at `open`.
     #[prost(message, optional, tag = "7")]
     pub receipt: ::core::option::Option<Receipt>,
-    /// The value that `Environment.success` compares. Absent if it has no value, e.g. the time to a goal that was never
-    /// reached.
+    /// The quantity that `Environment.success` compares with its threshold. Absent if the quantity has no value, e.g. the
+    /// time to a goal that was never reached.
     #[prost(double, optional, tag = "8")]
     pub achieved: ::core::option::Option<f64>,
-    /// The value that `Environment.code_success` compares. Absent if it has no value.
+    /// The quantity that `Environment.code_success` compares with its threshold. Absent if the quantity has no value.
     #[prost(double, optional, tag = "9")]
     pub code_achieved: ::core::option::Option<f64>,
 }
 /// The numbers that identify an episode. Together with the seed they determine its parameters and initial state.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Episode {
-    /// The environment's index: `first_environment_index` plus its slot, or that of the restored snapshot.
+    /// The environment's index: `first_environment_index` plus its position, at `open`, in the session or its group. A
+    /// restored environment has the index in the snapshot.
     #[prost(uint32, tag = "1")]
     pub environment_index: u32,
     /// The number of the trial, counted from 0 for each environment.
@@ -678,9 +684,9 @@ pub struct Snapshotted {
     #[prost(bytes = "bytes", repeated, tag = "1")]
     pub snapshots: ::prost::alloc::vec::Vec<::prost::bytes::Bytes>,
 }
-/// Restores saved environments. For the same actions they then give the same bytes as after the snapshot. Either all are
-/// restored, or none. A session in AUTORESET_MODE_SAME_STEP refuses an environment that was saved after its episode
-/// ended.
+/// Restores saved environments. A restored environment gives the same bytes for the same actions as the saved
+/// environment did. Either all snapshots are restored, or none. A session in AUTORESET_MODE_SAME_STEP refuses an
+/// environment that was saved after its episode ended.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Restore {
     /// The mask of the environments; empty = all.
@@ -697,8 +703,8 @@ pub struct Restored {
     #[prost(bytes = "bytes", tag = "1")]
     pub observations: ::prost::bytes::Bytes,
 }
-/// Draws a picture of one environment, and changes nothing. FAILED_PRECONDITION if the server cannot draw it; the
-/// message says what is missing.
+/// Draws a picture of one environment, and changes nothing. The error is FAILED_PRECONDITION if the server cannot draw
+/// the environment, and its message says what is missing.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Render {
     /// The index of the environment in the batch, 0 … N-1.
@@ -728,37 +734,37 @@ pub struct Rendered {
 /// their order. Their slots are numbered again from 0, and N becomes their number.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Release {
-    /// The mask of the environments to free. At least one must be selected, and at least one not, so an empty mask (all)
-    /// is refused.
+    /// The mask of the environments to free. It must select at least one environment but not all, so an empty mask is
+    /// refused.
     #[prost(bytes = "bytes", tag = "1")]
     pub mask: ::prost::bytes::Bytes,
 }
 /// The environments are freed.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Released {}
-/// Lets the server play: it chooses the actions of all environments by a policy, steps them, and sends the rollout. The
-/// bytes are the same as if the client had chosen the actions, on any processor. Allowed only in
+/// Lets the server play a policy: the server chooses the actions of all environments, steps them, and sends the rollout.
+/// The bytes are the same as if the client had chosen the actions, on any processor. Allowed only in
 /// AUTORESET_MODE_SAME_STEP, and if all environments have the same number of episodes in a trial. T is the number of
-/// steps in a reply. H is the width of the policy's LSTM, 0 without one. I is the length of the policy's input: O, and
-/// with `Policy.outcomes` also the length of the last action (n numbers, one-hot, or A numbers) and 2 for its reward and
-/// whether it ended an episode.
+/// steps in a reply. H is the width of the policy's LSTM, 0 without an LSTM. I is the length of the policy's input. It
+/// is O without `Policy.outcomes`. With `Policy.outcomes` the input also has the last action (one-hot with n numbers if
+/// discrete, else A numbers), its reward, and whether it ended an episode, so I is O + n + 2 or O + A + 2.
 ///
 /// A request with `steps` or `episodes` begins a task. The server may divide a task over several replies: until a reply
 /// has `finished`, the client continues the task by requests without `steps` and `episodes`. `step`, `reset`, `restore`
-/// and `release` end the policy's play. An error after the task has begun, because a number is not finite
-/// (INVALID_ARGUMENT), also ends it. Then a policy must be sent again. An `act` out of order is refused with
-/// FAILED_PRECONDITION and changes nothing.
+/// and `release` end the policy's play. If a number becomes infinite or NaN during a task, the reply is an error
+/// (INVALID_ARGUMENT) and the policy's play also ends. To play again, the client must send a policy again. An `act` out
+/// of order is refused with FAILED_PRECONDITION and changes nothing.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct Act {
     /// The policy to play; if absent, the previous one continues. A new policy discards an unfinished task.
     #[prost(message, optional, tag = "1")]
     pub policy: ::core::option::Option<Policy>,
-    /// float32 \[P\]: all weights in a row, finite, in the order of docs/protocol.md. Empty: the previous weights; a new
-    /// policy needs weights. Not allowed while a task is unfinished.
+    /// float32 \[P\]: all P weights of the policy, finite, in the order that docs/protocol.md defines. If empty, the policy
+    /// keeps its weights. A new policy needs weights. Not allowed while a task is unfinished.
     #[prost(bytes = "bytes", tag = "2")]
     pub weights: ::prost::bytes::Bytes,
-    /// Maximal number of steps in this reply. 0 means the server's own limit, which also holds for larger numbers: about 4
-    /// MB or one second of computing, but at least one step.
+    /// Maximal number of steps in this reply; 0 means no limit by the client. The server always limits a reply to about
+    /// 4 MB and about one second of computing, but it plays at least one step.
     #[prost(uint32, tag = "5")]
     pub most_steps: u32,
     /// Whether the reply has only `steps`, `ended` and `finished`, which is enough to test a policy.
@@ -808,18 +814,19 @@ pub struct Policy {
     /// Statistics for the normalisation of rewards, not rewards themselves. If absent, rewards are not normalised.
     #[prost(message, optional, tag = "5")]
     pub rewards: ::core::option::Option<RewardMoments>,
-    /// The player's state from which to continue, only in training. It does not include the state of the environments. If
-    /// absent, a trial begins in every environment with its current observation, and discounted returns begin at 0. These
-    /// observations are added to the running statistics, even if the task then resets all environments.
+    /// The state of a saved player (`SavePlayer`) from which to continue, only in training. It does not include the state
+    /// of the environments. If absent, a trial begins in every environment with its current observation, and discounted
+    /// returns begin at 0. The current observations are then added to the running statistics, even if the task resets all
+    /// environments before its first step.
     #[prost(message, optional, tag = "8")]
     pub state: ::core::option::Option<PlayerState>,
-    /// The source of randomness, required.
+    /// Whether the policy plays in a training or in a test, with the source of its randomness. Required.
     #[prost(oneof = "policy::Role", tags = "6, 7")]
     pub role: ::core::option::Option<policy::Role>,
 }
 /// Nested message and enum types in `Policy`.
 pub mod policy {
-    /// The source of randomness, required.
+    /// Whether the policy plays in a training or in a test, with the source of its randomness. Required.
     #[derive(Clone, PartialEq, Eq, Hash, ::prost::Oneof)]
     pub enum Role {
         /// In training, every step is added to the statistics. All actions are sampled from this random stream, in order of
@@ -835,7 +842,7 @@ pub mod policy {
 /// parameters, and one entry for discounted returns.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct Moments {
-    /// The number of vectors, at most 2^53. If it is 0, all numbers below must be 0, too.
+    /// The number of vectors, at most 2^53. If it is 0, all entries of `mean` and `squares` must be 0, too.
     #[prost(uint64, tag = "1")]
     pub count: u64,
     /// float64 \[entries\]: means.
@@ -882,7 +889,8 @@ pub struct TestStreams {
     #[prost(uint64, tag = "1")]
     pub seed: u64,
 }
-/// The state of a player, with finite numbers; the state of the environments is in their snapshots.
+/// The state of a player, i.e. of a policy that the server plays. All numbers are finite. It does not include the state
+/// of the environments, which snapshots have.
 #[derive(Clone, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct PlayerState {
     /// float32 \[N, O\]: the normalised observations for the next actions.
@@ -922,23 +930,24 @@ pub struct Acted {
     /// float32 \[T, N\]: normalised rewards.
     #[prost(bytes = "bytes", tag = "7")]
     pub rewards: ::prost::bytes::Bytes,
-    /// uint8 \[T, N\]: 1 where the task ended the trial's last episode.
+    /// uint8 \[T, N\]: 1 where the environment, e.g. by a fall or a goal, ended the last episode of a trial.
     #[prost(bytes = "bytes", tag = "8")]
     pub terminated: ::prost::bytes::Bytes,
-    /// uint8 \[T, N\]: 1 where the step limit ended the trial's last episode.
+    /// uint8 \[T, N\]: 1 where the step limit ended the last episode of a trial.
     #[prost(bytes = "bytes", tag = "9")]
     pub truncated: ::prost::bytes::Bytes,
     /// float32 \[T, N\]: where `truncated` is 1, the estimated value of the last observation; 0 elsewhere.
     #[prost(bytes = "bytes", tag = "10")]
     pub truncation_values: ::prost::bytes::Bytes,
-    /// The episodes that ended, in order of steps, then of slots. In a task of complete episodes, only those that count.
+    /// The episodes that ended, in order of steps and, in each step, in order of slots. In a task of complete episodes,
+    /// only the episodes that count for `Act.episodes`.
     #[prost(message, repeated, tag = "11")]
     pub ended: ::prost::alloc::vec::Vec<EndedAt>,
     /// Whether the task is finished.
     #[prost(bool, tag = "12")]
     pub finished: bool,
-    /// float32 \[N\]: estimated values of the observations after the last step, or 0 after complete episodes. Only if
-    /// `finished`.
+    /// float32 \[N\], only if `finished`: estimated values of the observations after the last step. They are 0 if the task
+    /// was a number of complete episodes.
     #[prost(bytes = "bytes", tag = "13")]
     pub last_values: ::prost::bytes::Bytes,
     /// float32 \[N, 2H\]: the policy's memory before the task's first step; only in the task's first reply.
@@ -948,16 +957,18 @@ pub struct Acted {
 /// The end of an episode during an `act`.
 #[derive(Clone, PartialEq, ::prost::Message)]
 pub struct EndedAt {
-    /// The step of the reply in which it ended, 0 … T-1.
+    /// The step of the reply in which the episode ended, 0 … T-1.
     #[prost(uint32, tag = "1")]
     pub step: u32,
     /// The end of the episode.
     #[prost(message, optional, tag = "2")]
     pub end: ::core::option::Option<EpisodeEnd>,
-    /// Whether the task ended the episode. Unlike `Acted.terminated`, it is set for every episode of a trial.
+    /// Whether the environment, e.g. by a fall or a goal, ended the episode. Unlike `Acted.terminated`, it is set for
+    /// every episode of a trial.
     #[prost(bool, tag = "3")]
     pub terminated: bool,
-    /// Whether the step limit ended the episode. It is set for every episode of a trial. Both flags may be set.
+    /// Whether the step limit ended the episode. Unlike `Acted.truncated`, it is set for every episode of a trial. Both
+    /// flags may be set.
     #[prost(bool, tag = "4")]
     pub truncated: bool,
 }
@@ -985,7 +996,7 @@ pub struct PlayerSaved {
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]
 pub enum Comparison {
-    /// Not given, as by older servers.
+    /// Not given. Older servers do not send the direction.
     Unspecified = 0,
     /// An episode is a success if its quantity is the threshold or more.
     AtLeast = 1,
@@ -1027,7 +1038,7 @@ pub enum Version {
     /// E: every parameter is drawn from `Parameter.extreme`.
     Extreme = 3,
     /// R+E: each trial draws all its parameters from R or all from E, with probability 1/2. Distributions in a request's
-    /// `parameters` replace those of both.
+    /// `parameters` replace the distributions of R and the distributions of E.
     RandomOrExtreme = 4,
 }
 impl Version {

@@ -12,7 +12,7 @@ mod transport;
 use std::ops::Range;
 use std::pin::pin;
 use std::str::FromStr;
-use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -68,6 +68,8 @@ pub struct Session {
     last: Mutex<LastStep>,
     /// An upper bound of the length of one snapshot, bytes; 0 from older servers.
     snapshot_bytes: AtomicUsize,
+    /// Whether the server restored a snapshot into an environment.
+    restored: AtomicBool,
 }
 
 /// The observations and flags of a batch after the last reply. They are copies, because Python may change its arrays.
@@ -116,6 +118,7 @@ impl Session {
             state: Mutex::new(SessionState::New),
             last: Mutex::default(),
             snapshot_bytes: AtomicUsize::new(0),
+            restored: AtomicBool::new(false),
         })
     }
 
@@ -123,6 +126,12 @@ impl Session {
     #[setter]
     fn set_timeout(&self, seconds: f64) {
         *unpoisoned(&self.timeout) = duration(seconds);
+    }
+
+    /// Whether the server restored a snapshot into an environment. A long restore may fail after its first requests.
+    #[getter]
+    fn restored(&self) -> bool {
+        self.restored.load(Ordering::Relaxed)
     }
 
     /// Whether a thread is waiting for a reply.
@@ -375,6 +384,7 @@ impl Session {
             let open = self.take(0)?;
             let request = proto::Restore { mask: mask.clone(), snapshots: snapshots[part].to_vec() };
             let (_, restored) = self.ask(py, open, request)?;
+            self.restored.store(true, Ordering::Relaxed);
             // Check only the length of the observations. They may not be finite, because the physics of a snapshot may
             // have diverged.
             arrays::numbers(&restored.observations, &[self.selected(&mask), self.observation_size])?;

@@ -5,18 +5,29 @@ use std::sync::Weak;
 
 use perturb::server::embedded;
 use perturb_protocol::{Address, ClientError, Connection, Stream, Timeouts, TypedRequest, connect, proto};
+use pyo3::Borrowed;
 use pyo3::prelude::*;
 
 use crate::embedded::{EmbeddedStream, NativeServer};
 use crate::failure::{self, INVALID, RequestFailure, failure};
 
 /// The server that Python code passes to a session: an address as text, or the object of the embedded server.
-#[derive(FromPyObject)]
 pub enum NamedServer<'py> {
     /// The address of a server.
     Address(String),
     /// The embedded server.
     Embedded(PyRef<'py, NativeServer>),
+}
+
+impl<'a, 'py> FromPyObject<'a, 'py> for NamedServer<'py> {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'a, 'py, PyAny>) -> PyResult<Self> {
+        match object.cast::<NativeServer>() {
+            Ok(server) => Ok(Self::Embedded(server.to_owned().borrow())),
+            Err(_) => object.extract().map(Self::Address),
+        }
+    }
 }
 
 /// The server of a session.
