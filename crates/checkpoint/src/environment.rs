@@ -1,4 +1,4 @@
-//! The properties of an environment that a checkpoint stores.
+//! The part of a checkpoint that describes the environment of the training.
 
 use std::fmt;
 

@@ -35,7 +35,8 @@ impl<'a, T: Serialize> WithChecksum<'a, T> {
     }
 }
 
-/// Removes the checksum from a JSON document and compares it. Returns whether the document had a checksum.
+/// Removes the checksum from a JSON document and compares it with the rest of the document. Returns whether the
+/// document had a checksum.
 ///
 /// # Errors
 /// [`CHECKSUM_MISMATCH`] if the checksum is wrong.

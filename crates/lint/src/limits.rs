@@ -26,7 +26,7 @@ pub enum Check {
     ImportCycles,
     /// The share of doc comments that open without a subject, in percent, by folder.
     DocComments,
-    /// The number of type names that are defined in more than one file and are not exempt, in the whole repository.
+    /// The number of type names that more than one file of the repository defines, without the exempt names.
     TypesDefinedTwice,
     /// The number of constants with superlative names, by folder.
     SuperlativeConstants,

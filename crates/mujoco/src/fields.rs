@@ -223,9 +223,9 @@ model_arrays! {
         ActuatorTransmission = actuator_trntype: |m| m.nu,
         /// Indices of the elements on which each actuator acts, `[actuators, 2]`.
         ActuatorTarget = actuator_trnid: |m| 2 * m.nu,
-        /// Index of each sensor's first number in the sensor data, `[sensors]`.
+        /// Index in the sensor data of each sensor's first value, `[sensors]`.
         SensorAddress = sensor_adr: |m| m.nsensor,
-        /// Count of each sensor's numbers in the sensor data, `[sensors]`.
+        /// Number of values that each sensor writes to the sensor data, `[sensors]`.
         SensorDimension = sensor_dim: |m| m.nsensor,
     }
 }

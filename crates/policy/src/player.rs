@@ -72,7 +72,7 @@ pub struct PlayerState {
     pub observations: Vec<f32>,
     /// `[N]` whether the environment's observation is the first of a trial.
     pub starts: Vec<bool>,
-    /// `[N, E]` the previous steps, see [`Inputs`].
+    /// `[N, E]` previous step of every environment: action, reward and done flag. E = 0 without RL².
     pub previous_steps: Vec<f32>,
     /// `[N, S]` the policy's memory; empty for a feed-forward policy.
     pub memory: Vec<f32>,

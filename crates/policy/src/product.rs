@@ -37,9 +37,10 @@ impl Matrix {
         let inputs = matrix.len() / outputs;
         for (block, lanes) in matrix.chunks(LANES * inputs).zip(self.data.chunks_exact_mut(self.inputs)) {
             let lanes = &mut lanes[first..][..inputs];
-            let done = if block.len() == LANES * inputs { transpose(block, lanes) } else { 0 };
+            // Most columns of a full block are transposed, four at a time. The loop copies all other columns.
+            let n_transposed = if block.len() == LANES * inputs { transpose(block, lanes) } else { 0 };
             for (o, row) in block.chunks_exact(inputs).enumerate() {
-                lanes[done..].iter_mut().zip(&row[done..]).for_each(|(lane, weight)| lane[o] = *weight);
+                lanes[n_transposed..].iter_mut().zip(&row[n_transposed..]).for_each(|(lane, weight)| lane[o] = *weight);
             }
         }
     }

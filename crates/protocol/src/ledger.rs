@@ -79,7 +79,7 @@ pub struct DrawRecord {
     /// The session that owns the environments.
     #[serde(flatten)]
     pub who: LedgerSession,
-    /// The regions from which environments begin to draw.
+    /// The regions from which the environments in `begins` draw.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub regions: Vec<Region>,
     /// The environments that begin to draw from these regions.

@@ -27,7 +27,7 @@ const QUEUE_LENGTH: usize = 4;
 /// Maximal time that [`Stream::close`] waits for the server to end the session.
 const CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 
-/// A type of request of a session, which names the type of its reply.
+/// A type of request that a session can send. It determines the type of the reply.
 pub trait TypedRequest: Into<Request> {
     /// The type of the reply.
     type Reply;

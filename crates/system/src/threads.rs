@@ -4,7 +4,8 @@ use std::io::Error;
 
 use rustix::process::{Resource, getrlimit};
 
-/// Adds an explanation to the error of starting a thread or process: the limits of the user and of a container.
+/// Explains why a thread or process could not be started. Returns `error` with the limits that the user or a container
+/// may have reached.
 pub fn explain_no_thread(error: &Error) -> Error {
     let limit = getrlimit(Resource::Nproc).current.map_or_else(|| "unlimited".into(), |limit| limit.to_string());
     let words = format!(
