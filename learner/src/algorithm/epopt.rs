@@ -32,8 +32,8 @@ pub struct EpisodeSelection {
     pub kept_steps: u64,
     /// Mean return of all L episodes.
     pub mean_return: f64,
-    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes, where ε is the configured share even in
-    /// the first iterations.
+    /// Conditional value at risk: the mean return of the ⌈εL⌉ worst episodes, where ε is the configured share. This
+    /// also holds in the first iterations, which learn from all episodes.
     pub cvar: f64,
 }
 

@@ -92,7 +92,7 @@ struct RunningCell<'a> {
     trained: Option<Result<Checkpoint, CellFailure>>,
 }
 
-/// The reason why a cell has no result, as text, with its class.
+/// The reason why a cell has no result, as text, and the class of the failure.
 #[derive(Clone, Debug)]
 struct CellFailure {
     reason: String,

@@ -95,7 +95,8 @@ pub(super) fn open_request(
 }
 
 impl OpenOptions {
-    /// Returns the group of `size` environments of this option, starting with environment `first`.
+    /// Returns the protocol's description of `size` of these environments. `first` is the index of the first of them.
+    /// Returns `None` if a number exceeds the protocol's 32 bits.
     fn group(&self, first: usize, size: usize) -> Option<proto::SlotGroup> {
         Some(proto::SlotGroup {
             size: u32::try_from(size).ok()?,

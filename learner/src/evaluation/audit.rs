@@ -108,9 +108,12 @@ fn replay(
     }
 }
 
-/// Chooses at most `max_episodes` of `episodes`. Divides them into this many equal parts and takes one episode from
-/// each: the first of the first part, the second of the second part, and so on. So both early and late episodes of
-/// environments are chosen.
+/// Chooses at most `max_episodes` of `episodes`, evenly spread over all of them.
+///
+/// Divides `episodes` into nearly equal parts and takes one episode from each part: the first episode of the first part,
+/// the second episode of the second part, and so on. After the last position in a part, the next part begins with the
+/// first position again. The episodes of an environment are adjacent. Taking the first episode of every part could
+/// therefore choose only the early episodes of each environment.
 fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = max_episodes.min(episodes.len());
     (0..count).map(move |i| {

@@ -85,7 +85,8 @@ pub fn heatmap(
 /// Computes the heatmap of a recorded test again, without playing. `environment` provides the ranges of the axes.
 ///
 /// # Errors
-/// [`HeatmapError`] if the episodes are not of this policy, or not from a heatmap over these parameters.
+/// [`HeatmapError`] if `parameters` cannot be axes, if the episodes were recorded with another policy or are not from a
+/// heatmap over `parameters`, or if the environment has changed since the training.
 pub fn heatmap_again(
     environment: &proto::Environment,
     checkpoint: &Checkpoint,

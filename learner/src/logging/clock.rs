@@ -17,8 +17,8 @@ impl Clock {
         Self::new(now - elapsed, elapsed)
     }
 
-    /// Starts the clock now, with `elapsed` seconds of earlier training. `t_start` is the time of second 0, in seconds
-    /// since 1970.
+    /// Starts the clock now, with `elapsed` seconds of earlier training. `t_start` is the time at which the
+    /// training would have started without interruptions, in seconds since 1970.
     pub fn new(t_start: f64, elapsed: f64) -> Self {
         Self { t_start, before: elapsed, since: Instant::now() }
     }
@@ -28,7 +28,7 @@ impl Clock {
         self.before + self.since.elapsed().as_secs_f64()
     }
 
-    /// Returns the time of second 0, in seconds since 1970.
+    /// Returns the time at which the training would have started without interruptions, in seconds since 1970.
     pub fn t_start(&self) -> f64 {
         self.t_start
     }
