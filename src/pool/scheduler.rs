@@ -284,8 +284,8 @@ impl StepScheduler {
             job.prepare();
             let shards = job.shards.len();
             // Jobs that wait in the queue come first. If no job waits and this job has a single shard, this worker runs
-            // the job again directly, because the environments are in its core's cache. If the job were queued, another
-            // worker might take it.
+            // the job again directly: the cache of this worker's core holds the environments. If the job were queued,
+            // another worker might take the job.
             let runs_here = shards == 1 && self.waiting.load(Ordering::Acquire) == 0;
             if !runs_here {
                 self.push(job, shards, shards - 1);

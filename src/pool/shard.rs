@@ -153,19 +153,19 @@ impl Shard {
         self.slots.iter().map(|episodes| (episodes.id().environment_index, episodes.id().trial_index))
     }
 
-    /// The slots of this shard, as numbered in the batch, whose episodes have ended.
+    /// The slots of this shard whose episodes have ended. The slots count from the first slot of the batch.
     pub(super) fn ended_slots(&self) -> impl Iterator<Item = usize> {
         let ended = self.slots.iter().enumerate().filter(|(_, episodes)| episodes.ended());
         ended.map(|(slot, _)| self.first_slot + slot)
     }
 
-    /// The current distributions of the environment in a slot. `slot` is numbered in the batch.
+    /// The current distributions of the environment in a slot. `slot` counts from the first slot of the batch.
     pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
         &self.slots[slot - self.first_slot].settings().distributions
     }
 
-    /// The address of the current episode in a slot: seed, environment index and episode index. `slot` is numbered in
-    /// the batch.
+    /// The address of the current episode in a slot: seed, environment index and episode index. `slot` counts from the
+    /// first slot of the batch.
     pub(super) fn draw(&self, slot: usize) -> Draw {
         self.slots[slot - self.first_slot].draw()
     }
@@ -175,7 +175,7 @@ impl Shard {
         self.slots.iter().map(Episodes::draw)
     }
 
-    /// The scene to draw of the environment in a slot. `slot` is numbered in the batch.
+    /// The scene to draw of the environment in a slot. `slot` counts from the first slot of the batch.
     pub(super) fn scene(&self, slot: usize) -> Option<Scene> {
         self.slots[slot - self.first_slot].scene()
     }

@@ -19,15 +19,15 @@ pub(super) trait SharedModel: Sync + 'static {
     /// Whether two edits result in the same model.
     fn is_same(a: &Self::Edit, b: &Self::Edit) -> bool;
 
-    /// Applies an edit to the model of a simulation. `before` is the edit that the simulation's model has now; `None`
-    /// if this edit is not known.
+    /// Applies an edit to the model of a simulation. `before` is the edit that is now applied to this model; `None`
+    /// if that edit is not known.
     ///
     /// # Errors
     /// MuJoCo's fatal errors.
     fn write(&self, simulation: &mut Simulation, before: Option<&Self::Edit>, edit: &Self::Edit) -> Result<(), Error>;
 }
 
-/// A thread's simulation of a model, and the edit that its model has now.
+/// A thread's simulation of a model, and the edit that is now applied to the simulation's model.
 pub(super) struct Shared<T: SharedModel> {
     shared_model: &'static T,
     simulation: Simulation,
@@ -72,7 +72,7 @@ pub(super) fn with<T: SharedModel, R>(
 }
 
 impl<T: SharedModel> Shared<T> {
-    /// Returns the edit that the simulation has now, if `is_wanted` returns true for this edit. Otherwise calls `make`,
+    /// Returns the edit that is now applied, if `is_wanted` returns true for this edit. Otherwise calls `make`,
     /// which applies a new edit to the simulation and returns the new edit. The state of the simulation is undefined
     /// afterwards.
     ///

@@ -15,7 +15,7 @@ pub(super) struct ActionPath {
     oldest: usize,
     /// The action of the current step before noise and scale, `[A]`. `action_hold` may repeat it in the next step.
     held: Vec<f32>,
-    /// The action of the current step with noise and scale, which the physics receive, `[A]`.
+    /// The action of the current step after noise and scale, `[A]`. The physics receive this action.
     acting: Vec<f32>,
 }
 

@@ -21,8 +21,8 @@ impl SensorPath {
         Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
     }
 
-    /// Begins an episode. `observe` writes the first exact observation. The policy sees this observation, with noise
-    /// and dropout, until the second observation has passed the delay.
+    /// Begins an episode. The callback `observe` writes the first exact observation. The policy sees this observation,
+    /// with noise and dropout, until the second observation has passed the delay.
     pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
         self.exact.resize((values.sensor_delay + 1) * width, 0.0);
@@ -33,8 +33,8 @@ impl SensorPath {
         self.see(values, draw, 0);
     }
 
-    /// Adds the exact observation after `steps` steps of the episode, which `observe` writes. Updates the observation
-    /// that the policy sees.
+    /// Adds the exact observation after `steps` steps of the episode. The callback `observe` writes this observation.
+    /// Updates the observation that the policy sees.
     pub(super) fn pass(
         &mut self,
         values: &DisturbanceValues,
@@ -93,8 +93,8 @@ impl SensorPath {
         out.extend(older.iter().chain(newer).map(|&number| f64::from(number)));
     }
 
-    /// Loads the numbers that [`SensorPath::save`] appended. Their count must be [`SensorPath::n_saved`]. `observe`
-    /// writes the newest exact observation.
+    /// Loads the numbers that [`SensorPath::save`] appended. The count of `saved` must be [`SensorPath::n_saved`].
+    /// `save` leaves out the newest exact observation, so the callback `observe` writes this observation.
     ///
     /// # Errors
     /// [`Error::Snapshot`] if a number is not finite as float32. After an error, the state of the path is undefined.

@@ -18,7 +18,7 @@ use roxmltree::Node;
 use std::collections::BTreeMap;
 
 /// A length, size, radius or position of the model that a parameter edits. After such an edit the model must be
-/// compiled again.
+/// compiled again. In this module, a slot is such an edited quantity, and not an environment's position in a batch.
 #[derive(Debug)]
 pub(super) struct Slot {
     /// The index of the parameter.
@@ -30,7 +30,7 @@ pub(super) struct Slot {
 }
 
 impl Slot {
-    /// Collects the slots of all parameters.
+    /// Collects the slots of all parameters: one [`Slot`] for each target that requires a new compilation.
     pub(super) fn all(parameters: &[EditedParameter], model: &Model) -> Vec<Self> {
         let mut slots = Vec::new();
         for (parameter, edited) in parameters.iter().enumerate() {
@@ -60,8 +60,8 @@ impl Slot {
     }
 }
 
-/// A summand of a number in the text. If `slot` is `None`, the summand is `coefficient`. Otherwise the summand is
-/// `coefficient` times the slot's amount, and the amount is squared if `squared`.
+/// A summand of a number in the text. If `slot` is `None`, the summand is `coefficient`. Otherwise `slot` is the index
+/// of a [`Slot`], and the summand is `coefficient` times [`Slot::amount`]. The amount is squared if `squared`.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
@@ -109,7 +109,7 @@ enum Piece {
     Element(String, Vec<Attribute>, &'static str),
 }
 
-/// A model's text whose numbers depend on the amounts of slots.
+/// A model's text whose numbers depend on the amount of each [`Slot`].
 #[derive(Debug)]
 pub(super) struct EditedText {
     pieces: Vec<Piece>,
@@ -225,7 +225,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Finds the slot that scales a body. Returns an error if two slots scale the body.
+    /// Finds the [`Slot`] that scales a body. Returns an error if two slots scale the body.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
         for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {
@@ -383,8 +383,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         }
     }
 
-    /// Scales the numbers of an attribute: the first numbers by one slot of `first` each, the remaining numbers by the
-    /// slot `rest`.
+    /// Scales the numbers of an attribute. `first` and `rest` are indices of [`Slot`]s. The [`Slot`] `first[i]` scales
+    /// number i. The [`Slot`] `rest` scales the numbers beyond the end of `first`. `None` leaves a number unchanged.
     fn scale(
         &mut self,
         node: Node<'a, 'input>,

@@ -118,9 +118,9 @@ impl EditedParameter {
         })
     }
 
-    /// Reads the parameter's value back from the edited `model`. If its targets have different values, returns the
-    /// value that differs most from `requested`. `own` is the folder's model without edits, `compiled` the model with
-    /// edited lengths but without other edits.
+    /// Reads the parameter's value back from the edited `model`. If the parameter's targets have different values,
+    /// returns the value that differs most from `requested`. `own` is the folder's model without edits. `compiled` is
+    /// the model with edited lengths but without other edits.
     pub(super) fn read_back(&self, (own, compiled): (&Model, &Model), model: &Model, requested: f64) -> f64 {
         let values = self.edits.iter().flat_map(|edit| {
             edit.targets.all.iter().map(|target| {

@@ -117,8 +117,8 @@ impl Source<'_> {
                 BALL => &FREE_VELOCITY[3..],
                 _ => &[""],
             };
-            // A free or ball joint has several positions and velocities, which have names. Other joints have one
-            // position and one velocity.
+            // A free or ball joint has several positions and several velocities, and each of them has a name. Other
+            // joints have one position and one velocity, without names.
             let (parts, first) = if get == "position" { (positions, position) } else { (velocities, velocity) };
             if matches!(get, "sin" | "cos" | "scaled") && parts.len() > 1 {
                 let problem =

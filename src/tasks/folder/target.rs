@@ -308,7 +308,7 @@ fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
 }
 
 impl Target {
-    /// Returns the array and the index of the number that holds the value.
+    /// Returns the place of the target's value in the model: the array, and the index of the number in the array.
     pub(super) fn place(self) -> (Field, usize) {
         match self {
             Self::Number(field, at) | Self::Twins(field, at) => (field, at),
