@@ -231,13 +231,13 @@ impl<'a> MethodResults<'a> {
 }
 
 impl<'a> SelectedRun<'a> {
-    /// Returns the selected policy that was trained on this distribution; the first one if several tie.
+    /// Returns the selected policy that was trained on the distribution `trained_on`; the first one if several tie.
     pub fn trained_on(&self, trained_on: TrainedOn<'_>) -> Option<Reported<'a>> {
         self.selected.get(&trained_on).copied().flatten()
     }
 
-    /// Returns the selected policy that was trained on this distribution, and the policies that tie with it, in the
-    /// plan's order.
+    /// Returns the selected policy that was trained on the distribution `trained_on`, and the policies that tie with
+    /// the selected one, in the plan's order.
     pub fn tied_on(&self, trained_on: TrainedOn<'_>) -> Vec<Reported<'a>> {
         let tied = self.tied.get(&trained_on).into_iter().flatten().copied().map(Reported::Cell);
         self.trained_on(trained_on).into_iter().chain(tied).collect()

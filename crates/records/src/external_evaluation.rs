@@ -72,7 +72,7 @@ pub struct PolicyMetadata {
     /// The quantities that the policy observes.
     pub observe: Observe,
     /// Whether actions were the mode of the policy's distribution instead of samples. `None` if the evaluation did not
-    /// control this.
+    /// control how actions are chosen.
     pub deterministic: Option<bool>,
 }
 
@@ -117,10 +117,10 @@ pub enum ExternalEvaluationError {
     /// `assessment.json` has a format version that this program cannot read.
     #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
     Format { path: PathBuf, got: u64 },
-    /// The policies are of different environments, or two have the same training distribution.
+    /// There are no policies, the policies are of different environments, or two have the same training distribution.
     #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
-        /// A clause that says what the policies have in place of this, e.g. "they are of CartPole and Pendulum".
+        /// The last clause of the message. It describes the policies that were given, e.g. "they are of CartPole and Pendulum".
         got: String,
     },
     /// The folder to write to is not empty.

@@ -345,6 +345,7 @@ impl Drawn {
     fn episodes(&self) -> u64 {
         match self.last {
             LastDraw::None => 0,
+            // The number is `last` - `first` + 1, or 0 if `last` is before `first`.
             LastDraw::Episode(last) => last.saturating_sub(self.first).saturating_add(u64::from(last >= self.first)),
             LastDraw::Unknown => u64::MAX,
         }

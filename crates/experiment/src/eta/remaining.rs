@@ -119,7 +119,7 @@ mod tests {
         let a_third = Some((20.0, Some(2.0)));
         assert_eq!(seconds(&times, &[(hopper, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(hopper, a_third), (hopper_2, None)], 1), Some(100.0));
-        // Two cells shared one process for 20 s, so each took 10 s and needs 20 s more.
+        // Two cells shared one process for 20 s, so each took 10 s for its first third and needs 20 s more.
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, a_third)], 1), Some(40.0));
         assert_eq!(seconds(&times, &[(cart_pole, a_third), (cart_pole_2, None), (hopper, None)], 1), None);
     }

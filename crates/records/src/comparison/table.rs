@@ -9,8 +9,8 @@ use super::scores::TestScores;
 use super::{ComparedScore, ConditionComparison, TestedCondition, check, compared};
 use crate::results_table::{SELECTION_TEST, TableRow};
 
-/// A condition whose tests are rows of a results table. Each cell (training) of these rows is a policy of the condition.
-/// The policies differ only in their seed.
+/// A condition whose tests are rows of a results table. Each training (cell of an experiment) that these rows test gives one
+/// policy of the condition. The policies differ only in their seed.
 #[derive(Clone, Debug)]
 pub struct TableCondition<'a> {
     /// The condition's name. It is freely chosen, but no two conditions may have the same name.

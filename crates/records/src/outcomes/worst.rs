@@ -56,7 +56,8 @@ pub fn worst_contexts(outcomes: &Outcomes) -> Option<f64> {
     if parts.len() < MIN_PARTS {
         return None;
     }
-    // Ranks the regions by their success rate in half `chooses` (0 or 1), and measures success in the other half.
+    // Ranks the regions by their success rate in one half of the episodes, and measures success in the other half.
+    // `chooses` is the number of the half that ranks, 0 or 1.
     let mut one_way = |chooses: usize| {
         parts.sort_by(|a, b| a.rate(chooses).total_cmp(&b.rate(chooses)));
         worst_success_rate(&parts, chooses)

@@ -13,8 +13,8 @@ pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
 /// Colour of frames and ticks.
 pub(super) const FRAME: RGBColor = RGBColor(120, 120, 120);
 
-/// The colours of lines, after Okabe and Ito (2008). [`INK`] takes the place of their black, so that a dark page can
-/// replace it. Yellow is left out because it is hard to see on white.
+/// The colours of lines, after Okabe and Ito (2008). Their black is replaced by [`INK`], for which a dark page has another
+/// colour. Their yellow is left out because yellow is hard to see on white.
 pub(super) const LINES: [RGBColor; 7] = [
     INK,
     RGBColor(0, 114, 178),

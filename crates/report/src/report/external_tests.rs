@@ -10,7 +10,7 @@ use crate::report::{Report, ReportError, ReportInputs};
 const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff', 'rc']";
 
-/// Makes a report of made-up results of `plan` and of `assessed`, and returns the result of `of` for it.
+/// Makes a report of made-up results of `plan` and of `assessed`, passes the report to `of`, and returns the result of `of`.
 fn report<T>(plan: &Plan, assessed: &[ExternalEvaluation], of: impl Fn(&Report<'_>) -> T) -> T {
     let results = fixture::results(plan, |cell| Some(([f64::from(cell.run) + 90.0, 70.0, 50.0], 1.0)));
     let mut selections = results.select();

@@ -32,7 +32,7 @@ pub struct HeatmapPictures {
 }
 
 /// A picture without its colour scale. All pictures of an environment share a colour scale, which depends on all of their
-/// heatmaps. It is therefore known only after all drafts are made.
+/// heatmaps. The scale is therefore known only after all drafts are made.
 struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,

@@ -72,7 +72,7 @@ struct LogCursor {
 
 impl<'a> Jobs<'a> {
     /// Returns the backend for `plan` in `folder`. `costs` estimates the duration of each cell, in seconds by index in
-    /// the plan. It is called at most once, before the first submission that needs it.
+    /// the plan. `costs` is called at most once, before the first submission that needs it.
     pub fn new(
         plan: &'a Plan,
         folder: &'a Folder,

@@ -28,8 +28,8 @@ fn of_one_kind() -> Plan {
 }
 
 /// The fake `sbatch`. It numbers submissions and adds their jobs to the file `queue`. Then it runs the test's
-/// `hook.sh`, if there is one, which may change results and the queue. In it, $script is the job script and $number the
-/// array's number.
+/// `hook.sh` if there is one. `hook.sh` may change results and the queue. In `hook.sh`, $script is the job script, and
+/// $number is the array's number.
 const SBATCH: &str = r#"
 [ ! -f refusal ] || { cat refusal >&2; exit 1; }
 for argument in "$@"; do
