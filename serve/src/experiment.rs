@@ -32,9 +32,9 @@ pub(crate) struct LiveExperiment {
     /// The served folder. Symbolic links that lead out of it are not followed.
     root: PathBuf,
     path: PathBuf,
-    /// Time of the last reading; `None` before the first.
+    /// Time at which the experiment's files were last read; `None` before the first time.
     read: Option<Instant>,
-    /// Duration of the last reading.
+    /// Time that it took to read the experiment's files the last time.
     read_duration: Duration,
     /// Stamps (sizes and times) of the folder `cells/` and of the plan.
     stamps: [Option<Stamp>; 2],

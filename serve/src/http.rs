@@ -194,7 +194,7 @@ fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) ->
     let Some(place) = state.stream_places.take(peer) else {
         let message = "Too many pages are open already; close some.";
         let mut response = pages::message_page(StatusCode::SERVICE_UNAVAILABLE, message);
-        // Closes the connection, so that a client that repeats its request does not occupy a connection meanwhile.
+        // Closes the connection. The client will try again later, and must not occupy a connection until then.
         response.headers_mut().insert(header::CONNECTION, HeaderValue::from_static("close"));
         return response;
     };

@@ -120,9 +120,10 @@ fn condition(text: &str) -> Result<NamedPolicies> {
         policies.extend(policies_at(path)?);
     }
     let seeds: BTreeSet<String> = policies.iter().filter_map(seed).collect();
-    let are_keys = seeds.len() == policies.len();
+    // If each policy has its own seed, the seeds are the policies' keys. Otherwise the keys are 1, 2, 3 and so on.
+    let seeds_are_keys = seeds.len() == policies.len();
     let key = |place: usize, policy: &ComparedPolicy| {
-        seed(policy).filter(|_| are_keys).unwrap_or_else(|| (place + 1).to_string())
+        seed(policy).filter(|_| seeds_are_keys).unwrap_or_else(|| (place + 1).to_string())
     };
     let policies = policies.into_iter().enumerate().map(|(place, policy)| (key(place, &policy), policy));
     Ok(NamedPolicies { policies: policies.collect(), name })

@@ -71,7 +71,8 @@ pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()
 pub(super) fn prepare_for(plan: &Plan) -> Result<()> {
     let cells = || plan.cells.iter().chain(&plan.candidates);
     let recurrent = cells().find(|cell| cell.config.common.architecture != Architecture::Ff);
-    // One thread is required, because results must not depend on variables that a cluster sets in its shell profile.
+    // OpenBLAS must run with one thread. A cluster's shell profile may set another number in OPENBLAS_NUM_THREADS, and
+    // the number of threads would change the results.
     prepare(recurrent.map_or(Architecture::Ff, |cell| cell.config.common.architecture), true)
 }
 

@@ -44,7 +44,7 @@ pub enum VideoError {
         /// Why ffmpeg cannot be used.
         reason: String,
     },
-    /// The operating system refused a file.
+    /// The operating system refused to create or write a file.
     #[error(transparent)]
     File(#[from] FileError),
     /// A frame could not be encoded.

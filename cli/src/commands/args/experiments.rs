@@ -133,7 +133,8 @@ pub struct ExportArgs {
     /// Name of the study in the table [default: the name of DIR].
     #[arg(long, value_name = "NAME")]
     pub study: Option<String>,
-    /// Also write the whole table to this file as CSV. `-` or no name prints it and nothing else.
+    /// Also write the whole table to this file as CSV. If FILE is `-` or missing, the command
+    /// prints the CSV and nothing else.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub csv: Option<PathBuf>,
     /// Also copy the policies in DIR: their weights to policies/ID.safetensors beside FILE, and their test episodes to
