@@ -133,8 +133,8 @@ impl ThinnedFilm {
     /// Adds a frame that begins at `time`. If the film skips this frame, the frame before it is shown for longer. Times
     /// are in hundredths of a second.
     fn add(&mut self, indices: &[u8], width: usize, time: u64, delay: u16) {
-        // The film shows the last frame of an episode, which has a longer delay. It also shows each frame that is visible
-        // at a multiple of `interval`.
+        // The film shows the last frame of an episode, which has a longer delay, and each frame during which a multiple
+        // of `interval` occurs.
         if delay > self.frame_delay || time.next_multiple_of(self.interval) < time + u64::from(delay) {
             let frame = changed_rectangle(&mut self.visible, indices, width);
             self.bytes += FRAME_OVERHEAD_BYTES + frame.buffer.len() + frame.buffer.len().div_ceil(255);

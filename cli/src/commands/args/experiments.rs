@@ -133,8 +133,7 @@ pub struct ExportArgs {
     /// Name of the study in the table [default: the name of DIR].
     #[arg(long, value_name = "NAME")]
     pub study: Option<String>,
-    /// Also write the whole table to this file as CSV. If FILE is `-` or missing, the command
-    /// prints the CSV and nothing else.
+    /// Also write the whole table to this file as CSV. Without FILE, or with `-`, the command prints only the CSV.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub csv: Option<PathBuf>,
     /// Also copy the policies in DIR: their weights to policies/ID.safetensors beside FILE, and their test episodes to

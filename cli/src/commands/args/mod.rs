@@ -112,8 +112,7 @@ pub enum CliCommand {
 /// The option for JSON output.
 #[derive(Args, Clone, Debug)]
 pub struct JsonArgs {
-    /// Also write the result to this file as JSON. If FILE is `-` or missing, the command prints the
-    /// JSON and nothing else.
+    /// Also write the result to this file as JSON. Without FILE, or with `-`, the command prints only the JSON.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-")]
     pub json: Option<PathBuf>,
 }

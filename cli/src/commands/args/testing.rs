@@ -87,10 +87,11 @@ pub struct SetArgs {
   perturb audit results                              # all tests of the stored policies beside a results table
   perturb audit runs/quick --ledger ledger.jsonl     # replays nothing: checks the training environments")]
 pub struct AuditArgs {
-    /// Recorded tests: the --out folder of `perturb run`, the folder of a cell, the --records file of `perturb evaluate`,
-    /// or a folder that `Assessment.save` wrote in Python. DIR can also be a table of `perturb export --policies`, the
-    /// folder of the table, or a stored policy in that folder. For a table or a stored policy, --episodes does not
-    /// matter: all test episodes are replayed, and their checksums are compared with the checksums in the table.
+    /// Recorded tests: the --out folder of `perturb run`, the folder of a cell, the --records file of `perturb
+    /// evaluate`, or a folder that `Assessment.save` wrote in Python. DIR can also be a table of `perturb export
+    /// --policies`, the folder of the table, or a policy that was exported with the table. For a table or an exported
+    /// policy, --episodes has no effect: all test episodes are replayed, and their checksums are compared with those in
+    /// the table.
     pub dir: PathBuf,
     /// Tested policy of a records file: the --out folder of its training, its checkpoint folder, the folder of its
     /// cell, or a policy's name in results/ of the working directory or in the folder that PERTURB_RESULTS names. For
