@@ -45,8 +45,9 @@ pub struct ComparedRow {
     settings: String,
 }
 
-/// Compares conditions that consist of rows of a results table, in the tests on the given sets. If `sets` is None,
-/// compares them in the tests on all sets that the conditions have in common. Returns JSON.
+/// Compares conditions that consist of rows of a results table. `sets` names the test sets to compare on. None stands
+/// for all sets that every policy was tested on. If the rows are from several studies, None stands only for the versions
+/// among these sets. Returns JSON.
 #[pyfunction]
 #[pyo3(signature = (conditions, sets, score, baseline))]
 pub fn compare_rows(

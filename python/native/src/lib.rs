@@ -10,7 +10,8 @@
 //! - [`assessed`]: folders and reports of tests; [`comparison`]: comparisons of tests.
 //! - [`failure`]: the exception that the Python package converts to its errors.
 #![forbid(unsafe_code)]
-// The list above links to private modules for readers of this crate. Nothing is public, because only Python uses it.
+// The list above links to private modules for readers of this crate. The crate has no public items, because only Python
+// uses the crate.
 #![allow(rustdoc::private_intra_doc_links)]
 
 use numpy::{PyArray1, PyArrayMethods};

@@ -162,9 +162,10 @@ def compare(
 def compare_rows(
     conditions: list[tuple[str, list[dict[str, Any]]]], sets: list[str] | None, score: str, baseline: str | None
 ) -> str:
-    """Compare conditions that consist of rows of a results table, in the tests on these sets. Return JSON.
+    """Compare conditions that consist of rows of a results table. Return JSON.
 
-    If `sets` is None, the tests are those on all sets that the conditions have in common.
+    `sets` names the test sets to compare on. None stands for all sets that every policy was tested on. If
+    the rows are from several studies, None stands only for the versions among these sets.
     """
 
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:

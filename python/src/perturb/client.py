@@ -244,7 +244,7 @@ class Client:
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None) -> NDArray[np.float32]:
         """Restore snapshots into the environments that the mask selects. None selects all.
 
-        Returns the observations [N, O] of all environments. Environments that are not selected have their last
+        Returns the observations [N, O] of all environments. The rows of the other environments are their last
         observations.
         """
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):

@@ -194,7 +194,8 @@ def _array(values: ArrayLike, dtype: type[np.generic], name: str) -> NDArray[Any
     """Convert values to an array of a type.
 
     Raises:
-        PolicyError: for text, for booleans in place of numbers or numbers in place of booleans, and for a wrong rank.
+        PolicyError: for text, for booleans in place of numbers or numbers in place of booleans, and for a wrong number
+            of dimensions.
     """
     array = np.asarray(values)
     kinds = "b" if dtype is np.bool_ else "iuf"

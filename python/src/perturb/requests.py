@@ -346,7 +346,10 @@ def states(values: Any, num_envs: int, *, batched: bool) -> bytes:
 
 
 def mask(value: Any, num_envs: int, name: str) -> NDArray[np.bool_]:
-    """Check a mask, bool [N], that selects at least one environment, as Gymnasium's `reset_mask`, and return it."""
+    """Check that a mask is a bool array [N] and selects at least one environment. Return the mask.
+
+    Gymnasium's own batches require the same of `reset_mask`.
+    """
     is_mask = isinstance(value, np.ndarray) and value.dtype == np.bool_ and value.shape == (num_envs,)
     if not is_mask or not value.any():
         raise InvalidArgumentError(

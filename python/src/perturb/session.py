@@ -189,9 +189,10 @@ class Session:
     def reset(
         self, mask: bytes, seeds: Sequence[int], parameters: Intervals, states: bytes
     ) -> tuple[NDArray[np.float32], _native.Events]:
-        """Begin new episodes. Return observations [N, O], and the episodes that began.
+        """Begin new episodes in the environments that the mask selects.
 
-        Environments that are not reset have their last observations.
+        Returns the observations [N, O] of all environments, and the episodes that began. The rows of the other
+        environments are their last observations.
         """
         return self._call("reset", self._native.reset, mask, seeds, parameters, states)
 
@@ -209,9 +210,10 @@ class Session:
         return self._call("snapshot", self._native.snapshot, mask)
 
     def restore(self, mask: bytes, snapshots: Sequence[bytes]) -> NDArray[np.float32]:
-        """Restore snapshots into the environments that the mask selects. Return observations [N, O].
+        """Restore snapshots into the environments that the mask selects.
 
-        Environments that are not selected have their last observations.
+        Returns the observations [N, O] of all environments. The rows of the other environments are their last
+        observations.
         """
         return self._call("restore", self._native.restore, mask, snapshots)
 
@@ -333,7 +335,10 @@ class Session:
 
 
 def _listen(address: Address) -> str:
-    """Return the value of `--listen`, and further options, with which perturb-server listens at an address."""
+    """Return the text after `--listen` in a command that starts perturb-server at an address.
+
+    With TLS, the text also has the options for the certificate and its key.
+    """
     text = str(address)
     if text.startswith("unix:"):
         return text

@@ -58,7 +58,7 @@ def entry(task: TaskFolder) -> Mapping[str, Any]:
     """Run perturb-server to load a task folder. Return the task's description in the JSON format of catalogue.json.
 
     Raises:
-        InvalidArgumentError: if perturb-server refuses the folder. The error has its message.
+        InvalidArgumentError: if perturb-server refuses the folder. The error has perturb-server's message.
         ServerStartError: if perturb-server was not found, or fails.
     """
     program = local_server.find_program()

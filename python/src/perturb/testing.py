@@ -119,7 +119,8 @@ def play(
     Raises:
         PolicyError: if the policy does not fit the environment, or if its name is not the expected one.
     """
-    # Describe the environment, including the disturbances if a set names a disturbance. Prepare the policy for it.
+    # Describe the environment, including the disturbances if a set names a disturbance. Then prepare the policy for
+    # this environment.
     environment, observe = settings.environment, settings.observe
     names = [name for _, _, drawn, contexts in settings.sets for named in (drawn, *(contexts or ())) for name in named]
     address = None if settings.server is None else parse_address(settings.server)

@@ -305,10 +305,11 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
         """Restore M snapshots into the environments that the mask [N] selects, by default all.
 
-        Returns the observations [N, O]. Restored environments have the observations at which they were saved. Other
-        environments have their last observations. From then on, the same actions give the same bytes as after the
-        snapshot was saved. If one snapshot cannot be restored, no environment changes. Snapshots of more than 2 MiB in
-        total are restored in parts. If one part is refused, the snapshots of the parts before it stay restored.
+        Returns the observations [N, O] of all environments. The rows of restored environments are the observations at
+        which they were saved. The rows of the other environments are their last observations. After the restore, the
+        same actions give the same bytes as after the snapshot was saved. If one snapshot cannot be restored, no
+        environment changes. Snapshots of more than 2 MiB in total are restored in parts. If one part is refused, the
+        snapshots of the parts before it stay restored.
         """
         selected = None
         if mask is not None:

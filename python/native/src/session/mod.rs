@@ -314,8 +314,8 @@ impl Session {
         self.stepped(py, &labels, stepped)
     }
 
-    /// Begins new episodes in the environments that the mask selects. Returns observations `[N, O]`, and the episodes
-    /// that began. Other environments have their last observations.
+    /// Begins new episodes in the environments that the mask selects. Returns the observations `[N, O]` of all
+    /// environments, and the episodes that began. The rows of the other environments are their last observations.
     fn reset<'py>(
         &self,
         py: Python<'py>,
@@ -358,9 +358,11 @@ impl Session {
         Ok(snapshots)
     }
 
-    /// Restores snapshots into the environments that the mask selects. Returns observations `[N, O]`. Other
-    /// environments have their last observations. Snapshots that are too long for one request are sent in several
-    /// requests. If one of these requests is refused, the snapshots of the requests before it stay restored.
+    /// Restores snapshots into the environments that the mask selects. Returns the observations `[N, O]` of all
+    /// environments. The rows of the other environments are their last observations.
+    ///
+    /// Snapshots that are too long for one request are sent in several requests. If one of these requests is refused,
+    /// the snapshots of the earlier requests stay restored.
     fn restore<'py>(
         &self,
         py: Python<'py>,
