@@ -46,8 +46,8 @@ pub struct ComparedRow {
 }
 
 /// Compares conditions that consist of rows of a results table. `sets` names the test sets to compare on. None stands
-/// for all sets that every policy was tested on. If the rows are from several studies, None stands only for the versions
-/// among these sets. Returns JSON.
+/// for all sets that every policy was tested on. If the rows are from several studies, None stands only for the
+/// versions among these sets. Returns JSON.
 #[pyfunction]
 #[pyo3(signature = (conditions, sets, score, baseline))]
 pub fn compare_rows(
