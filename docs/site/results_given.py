@@ -62,7 +62,7 @@ GIVEN = {
     "docs/findings/cart-pole-ties.md": [
         # The plan.
         r"five seeds \(2 to 6\)",
-        r"25 of them on R",
+        r"25 are on R",
         r"only 5 and 128 steps",
         # The coverage of bootstrap intervals on normal data, which a test of the statistics measures.
         r"some 84 % of the cases",

@@ -59,7 +59,7 @@ class Cell:
         self.tests, self.marks = {}, defaultdict(dict)
         # Whether the episodes of the final policy have checksums.
         self.checked = last.get("checksum") is not None
-        # Rows of the final policy come last.
+        # Rows of intermediate policies come first, and rows of the final policy last.
         for row in rows if not self.failed else []:
             test = (100 * row["successes"] / row["episodes"], row["mean_return"], row["episodes"])
             self.marks[row["after_episodes"]][row["tested_on"]] = test

@@ -13,7 +13,7 @@ from results_words import CLEAN, FF, NAMES, Near, Pattern, about, fill, fixed, s
 
 
 def by_seed(studies, study, environment, method, seeds, **wanted):
-    """Return the lists of the three metrics over seeds."""
+    """Return a list for each of `METRICS`, with one number for each of `seeds`."""
     found = studies.by_seed(study, environment, method, **wanted)
     return list(zip(*(found[seed] for seed in seeds), strict=True))
 
