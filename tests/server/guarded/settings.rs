@@ -70,7 +70,7 @@ fn a_pipe_is_refused_at_the_start_and_not_waited_for() {
         let mut command = command();
         command.args(["--listen", "tcp://127.0.0.1:0", flag]).arg(&pipe);
         let words = refused(command);
-        assert!(words.contains("plain file") || words.contains("no file"), "{flag}: {words}");
+        assert!(words.contains("plain file") || words.contains("regular file"), "{flag}: {words}");
     }
 }
 
