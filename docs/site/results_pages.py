@@ -163,7 +163,7 @@ def classic_ff(studies):
     paper = {name: fill("{:.1f} ± {:.1f}", *studies.paper("CartPole", FF[name], "Extrapolation")) for name in shown}
     texts += [
         f"Of {grid['a2c']} A2C configurations trained on R with seed 1, {tied['a2c']} reach 100 %",
-        f"of {grid['ppo']} PPO configurations {tied['ppo']} do",
+        f"{tied['ppo']} of {grid['ppo']} PPO configurations tie",
         f"CartPole's Extrapolation is {shown['a2c']} for A2C and {shown['ppo']} for PPO, beside {paper['a2c']} and "
         f"{paper['ppo']} in the paper",
         f"belong to one of {tied['a2c']} tied configurations",
@@ -188,7 +188,7 @@ def classic_ff(studies):
     near = [max(gap[0][i], gap[1][i]) for i in range(3)]
     texts += [
         fill("A2C and PPO come within {:.1f}, {:.1f} and {:.1f} points of the paper's four-task averages", *near),
-        fill("EPOpt-PPO differs by {:.0f}, {:.0f} and {:.0f}.", *gap[3]),
+        fill("EPOpt-PPO differs by {:.0f}, {:.0f} and {:.0f} points", *gap[3]),
         f"A2C's Interpolation falls from {fixed(rows['a2c'][0][1][0], 0)} to {fixed(fmean(rows['a2c'][1][1]), 0)} %",
     ]
     return texts
@@ -285,8 +285,9 @@ def claims(studies):
     behind = [fmean(clean["epopt-ppo"][i]) - fmean(clean["ppo"][i]) for i in range(3)]
     papers = [studies.paper_mean(FF["epopt-ppo"], metric) - studies.paper_mean(FF["ppo"], metric) for metric in METRICS]
     texts.append(
-        f"PPO is {fixed(behind[1])} points behind EPOpt-PPO in Interpolation and {fixed(behind[2])} in Extrapolation, "
-        f"neither significant after Holm's correction ({fixed(papers[1])} and {fixed(papers[2])} behind in the paper)"
+        f"PPO is {fixed(behind[1])} points behind EPOpt-PPO in Interpolation and {fixed(behind[2])} points in "
+        "Extrapolation. Neither difference is significant after Holm's correction. "
+        f"In the paper PPO is {fixed(papers[1])} and {fixed(papers[2])} points behind"
     )
     strata = {name: gains(studies, "questions/findings", method, seeds) for name, method in FF.items()}
     corrected = holm([p_of(each) for each in strata.values()])
@@ -303,8 +304,8 @@ def claims(studies):
     mean = {name: [fmean(runs) for runs in each] for name, each in strata.items()}
     texts += [
         f"come from CartPole ({fixed(mean['A2C FF'][0], 0)} and {fixed(mean['PPO FF'][0], 0)} points) and Pendulum "
-        f"({fixed(mean['A2C FF'][1], 0)} and {fixed(mean['PPO FF'][1], 0)})",
-        f"RL²-A2C's comes from MountainCar ({fixed(mean['RL²-A2C RC'][3], 0)})",
+        f"({fixed(mean['A2C FF'][1], 0)} and {fixed(mean['PPO FF'][1], 0)} points)",
+        f"RL²-A2C's comes from MountainCar ({fixed(mean['RL²-A2C RC'][3], 0)} points)",
     ]
     lead = lead_of(studies, FF["a2c"], ("rl2-a2c", "rc", 2))
     texts.append(
@@ -364,8 +365,8 @@ def recurrent(studies):
     ]
     texts.append(
         fill(
-            "A2C RC minus A2C FF is {:.1f} points in Default, {:.1f} in Interpolation and {:.1f} in Extrapolation over "
-            "tasks and seeds, none significant ({:.1f}, {:.1f} and {:.1f} in the paper)",
+            "A2C RC minus A2C FF is {:.1f} points in Default, {:.1f} in Interpolation and {:.1f} in Extrapolation. "
+            "No difference is significant. In the paper the differences are {:.1f}, {:.1f} and {:.1f} points",
             *lead,
             *paper,
         )
@@ -373,7 +374,8 @@ def recurrent(studies):
     on_cart_pole = [
         by_seed(studies, "classic-rc", "CartPole", RECURRENT[name], seeds)[2] for name in ("A2C RC", "A2C FF")
     ]
-    texts.append(f"memory extrapolates better by {fixed(fmean(on_cart_pole[0]) - fmean(on_cart_pole[1]))} points")
+    gain = fmean(on_cart_pole[0]) - fmean(on_cart_pole[1])
+    texts.append(f"A2C with memory extrapolates better by {fixed(gain)} points")
     texts.append(f"Default ({fixed(lead_of(studies, RECURRENT['PPO FF'], RECURRENT['A2C FF'])[0])} points)")
     single = {
         "PPO FF": FF["ppo"],
@@ -422,16 +424,16 @@ def rl2(studies):
     better, worse = ahead("CartPole", "A2C FF"), ahead("CartPole", "A2C RC")
     texts.append(f"better than A2C FF by {fixed(min(better))} to {fixed(max(better))} points in each seed")
     texts.append(
-        f"better than A2C RC by {fixed(fmean(worse))} in the mean, of which one seed has {fixed(max(worse))} "
-        f"and another {fixed(min(worse))}"
+        f"better than A2C RC by {fixed(fmean(worse))} points in the mean (between {fixed(min(worse))} and "
+        f"{fixed(max(worse))} points by seed)"
     )
     behind = [[-number for number in ahead("Pendulum", other)] for other in ("A2C FF", "A2C RC")]
     texts.append(
-        f"by {fixed(min(behind[0]))} to {fixed(max(behind[0]))} points than A2C FF and by {fixed(min(behind[1]))} to "
-        f"{fixed(max(behind[1]))} than A2C RC"
+        f"It is {fixed(min(behind[0]))} to {fixed(max(behind[0]))} points behind A2C FF, and "
+        f"{fixed(min(behind[1]))} to {fixed(max(behind[1]))} points behind A2C RC"
     )
     on_acrobot = [-number for number in ahead("Acrobot", "A2C FF")]
-    texts.append(f"by {fixed(min(on_acrobot))} to {fixed(max(on_acrobot))} points of Extrapolation behind A2C FF")
+    texts.append(f"In Extrapolation it is {fixed(min(on_acrobot))} to {fixed(max(on_acrobot))} points behind A2C FF")
     on_r = studies.finished("classic-rc", environment="MountainCar", algorithm="rl2-a2c", trained_on="R")
     on_r = [cell for cell in on_r if cell.method[2] == 2 and cell.seed in seeds]
     shown = [fmean([cell.success(version) for cell in on_r]) for version in "RE"]
@@ -442,7 +444,7 @@ def rl2(studies):
             row = []
             for task in ("CartPole", "Pendulum"):
                 row += [one_seed(studies, task, method), papers(studies, task, method)]
-            texts.append(f"| {label if trials == 1 else ''}{trials} | " + " | ".join(row) + " |")
+            texts.append(f"| {label}{trials} | " + " | ".join(row) + " |")
     return texts
 
 
@@ -463,7 +465,7 @@ def locomotion(studies):
         f"Default is {spread(table['DD'])}, Interpolation {spread(table['RR'])}, Extrapolation {spread(extrapolation)}"
     )
     texts.append(
-        f"PPO trained on D succeeds in {fixed(fmean(table['DD']), 0)} % of its own episodes, "
+        f"PPO trained on D succeeds in {fixed(fmean(table['DD']), 0)} % of the episodes on D, "
         f"in {fixed(fmean(table['DR']), 0)} % on R "
         f"and in {fixed(fmean(table['DE']), 0)} % on E. Trained on E it reaches {fixed(fmean(table['EE']), 0)} % on E"
     )
@@ -472,10 +474,11 @@ def locomotion(studies):
     texts.append(f"| random policy | 0.0 (return {fixed(mean_return, 0)}) | 0.0 | 0.0 |")
     rates = {cell.settings["learning_rate"]: cell.tests["D"][1] for cell in studies.finished("locomotion-rate")}
     pairs = zip(table["RR"], table["DR"], strict=True)
-    (exception,) = [fill("{:.0f} and {:.0f}", *pair) for pair in pairs if pair[0] < pair[1]]
+    (exception,) = [fill("{:.0f} % trained on R, {:.0f} % trained on D", *pair) for pair in pairs if pair[0] < pair[1]]
     texts.append(f"with one exception ({exception})")
     texts.append(
-        f"2e-3 gave a return of {fixed(rates[2e-3], 0)}, 7e-4 {fixed(rates[7e-4], 0)} and 2e-4 {fixed(rates[2e-4], 0)}"
+        f"The mean return was {fixed(rates[2e-3], 0)} with a rate of 2e-3, {fixed(rates[7e-4], 0)} with a rate of 7e-4 "
+        f"and {fixed(rates[2e-4], 0)} with a rate of 2e-4"
     )
     a2c = [cell.success("D") for cell in studies.finished("locomotion", algorithm="a2c")]
     texts.append(fill("have {:.1f} and {:.1f} %", *a2c))
@@ -483,7 +486,7 @@ def locomotion(studies):
     shown = [
         fill("{:.1f} and {:.1f} % on {}", *(cell.success(version) for cell in cheetah), version) for version in "DRE"
     ]
-    texts.append(", ".join(shown) + " (seeds 2 and 3)")
+    texts.append("succeed in " + ", ".join(shown))
     done, _ = studies.planned("locomotion")
     return [*texts, f"**{done} of 72 cells**"]
 
@@ -538,7 +541,7 @@ def beyond(studies):
     first = rows[16, 4, 0.99, 0.01, 1e-3, True][0]
     texts += results_texts.beyond(studies, confirm, first)
     least = [least for key, (_, least, _) in rows.items() if not key[5]]
-    texts.append(f"the smallest margins are {fixed(max(least))} to {fixed(min(least))}")
+    texts.append(f"have margins from {fixed(max(least))} to {fixed(min(least))}")
     added = defaultdict(list)
     for cell in studies.finished("beyond/search-regularisation"):
         added[cell.settings.get("weight_decay", 0), cell.settings.get("observation_noise", 0)].append(cell)

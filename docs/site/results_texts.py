@@ -22,9 +22,10 @@ def acrobot(studies):
     # With one environment and five steps, most seeds fail.
     low, high = min(deviations[1:]), max(deviations[1:])
     return [
-        f"{updates[0]} updates of five steps and {updates[1]} of fifteen give the same success; {updates[2]} lose "
-        f"a point, and {updates[3]}, those of our default",
-        f"seeds differ by {fixed(low, 0)} to {fixed(high, 0)} points",
+        f"the same with {updates[0]} updates (rollouts of five steps) and with {updates[1]} updates (fifteen steps). "
+        f"With {updates[2]} updates it is one point lower. "
+        f"With {updates[3]} updates, the number of our default settings",
+        f"the standard deviation over seeds is {fixed(low, 0)} to {fixed(high, 0)} points",
     ]
 
 
@@ -151,15 +152,17 @@ def cart_pole(studies):
         "have 100.0 % on D",
         f"Their success on E ranges from {fixed(min(on_e), 0)} to {fixed(max(on_e), 0)} %",
         f"A2C's Extrapolation is {', '.join(some)} or {last}",
-        f"The paper's {paper['a2c'].split()[0]} lies among them",
+        f"The paper's {paper['a2c'].split()[0]} lies among these numbers",
         f"success on E falls by {fixed(min(falls['E']), 0)} to {fixed(max(falls['E']), 0)} points, and on D by up to "
-        f"{fixed(max(falls['D']), 0)}",
-        f"PPO rises from {fixed(mean(bare[3e-4], 'E', 1000), 0)} to {fixed(mean(bare[3e-4], 'E'), 0)} % on E at 3e-4, "
-        f"and stays at {fixed(mean(bare[3e-3], 'E', 1000), 0)} and {fixed(mean(bare[3e-3], 'E'), 0)} at 3e-3",
+        f"{fixed(max(falls['D']), 0)} points",
+        f"PPO's success on E rises from {fixed(mean(bare[3e-4], 'E', 1000), 0)} to {fixed(mean(bare[3e-4], 'E'), 0)} % "
+        f"at a rate of 3e-4, and changes from {fixed(mean(bare[3e-3], 'E', 1000), 0)} to "
+        f"{fixed(mean(bare[3e-3], 'E'), 0)} % at a rate of 3e-3",
         f"after 1 000 episodes has {fixed(mean(normalised, 'E', 1000), 0)} % with and "
         f"{fixed(mean(plain, 'E', 1000), 0)} % without it",
         f"({fixed(late[0], 0)} % with, {fixed(late[1], 0)} % without)",
-        f"1e-4 and 1e-5 keep {shown[1e-5]} % on E (four seeds of {fixed(least, 0)} to {fixed(most, 0)} % and one "
-        f"of {fixed(failed, 0)}), 1e-3, our default, {shown[1e-3]} %, and 1e-2 {shown[1e-2]} %",
+        f"success on E is {shown[1e-5]} % with a weight of 1e-4 or of 1e-5: four seeds have {fixed(least, 0)} to "
+        f"{fixed(most, 0)} %, and the fifth has about {fixed(failed, 0)} %. Success on E is {shown[1e-3]} % "
+        f"with a weight of 1e-3, our default, and {shown[1e-2]} % with a weight of 1e-2",
         "seeds end at 0 % on D",
     ]
