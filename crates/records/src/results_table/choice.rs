@@ -66,7 +66,8 @@ impl RowFilter {
 impl ResultsTable {
     /// Returns the rows that all `filters` accept, grouped by their values in the columns or settings `by`. Takes the rows
     /// of `study`, or of all studies if it is `None`. Groups are in the order of their first row. In the name of a group, a
-    /// number has the form `COLUMN=NUMBER`, and a text stands without its column.
+    /// number has the form `COLUMN=NUMBER`, and a text stands without its column. A text with spaces, quotes or equals signs
+    /// is quoted.
     ///
     /// # Errors
     /// [`ValueError`] for an unknown column.
@@ -93,6 +94,8 @@ impl ResultsTable {
             }
             let part = |(column, values): &(&String, Vec<String>)| match &values[place] {
                 number if number.parse::<f64>().is_ok() => format!("{column}={number}"),
+                // Quoted, so that groups with different values never have the same name.
+                text if text.contains([' ', '"', '=']) => format!("{text:?}"),
                 text => text.clone(),
             };
             let name = by.iter().map(part).collect::<Vec<_>>().join(" ");

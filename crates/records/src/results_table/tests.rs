@@ -145,3 +145,14 @@ fn rows_are_chosen_by_their_values_and_grouped() {
     assert!("algorithm".parse::<RowFilter>().unwrap_err().to_string().contains("COLUMN=VALUES"));
     assert!("seed=a..b".parse::<RowFilter>().is_err());
 }
+
+#[test]
+fn groups_with_different_texts_have_different_names() {
+    let mut table = ResultsTable::default();
+    let plan = StudyPlan { plan: "runs = 1".into(), beside: BTreeMap::new() };
+    let spaced = [("a b", "c"), ("a", "b c")];
+    table.merge("one", plan, spaced.map(|(cell, tested_on)| row("one", cell, tested_on)).into());
+    let groups = table.choose(None, &[], &["cell".to_owned(), "tested_on".to_owned()]).unwrap();
+    let names: Vec<&str> = groups.iter().map(|(name, _)| name.as_str()).collect();
+    assert_eq!(names, [r#""a b" c"#, r#"a "b c""#]);
+}
