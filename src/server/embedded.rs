@@ -116,7 +116,11 @@ impl EmbeddedSession {
         self.handler.pipeline(request)
     }
 
-    /// Checks a request's size and its numbers of entries, as `perturb-server` does before decoding.
+    /// Checks a request's size and its numbers of entries, as `perturb-server` does before decoding. Returns the
+    /// request. The inner error is the reason for refusing the request, e.g. too many entries.
+    ///
+    /// # Errors
+    /// The gRPC status with which `perturb-server` would end the session's stream, e.g. if the request is too large.
     async fn checked(&self, request: SessionRequest) -> Result<Result<SessionRequest, Error>, Status> {
         let limits = self.handler.request_limits();
         let limits = RequestLimits { bytes: limits.bytes.min(self.max_bytes), ..limits };
@@ -124,6 +128,7 @@ impl EmbeddedSession {
         if got > limits.bytes {
             return Err(status(&transport::Error::TooLarge { got, limit: limits.bytes }));
         }
+        // The decoder counts the entries in encoded bytes, so the request is encoded for it.
         let decoded = self.decoder.decode(request.encode_to_vec().into(), Session::FIELDS, limits).await?;
         Ok(decoded.map_err(|refusal| transport::Error::from(refusal).into()))
     }

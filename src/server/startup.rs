@@ -324,7 +324,7 @@ impl ServerParts {
     }
 }
 
-/// Builds the router of all gRPC services: authentication, raw request bodies, compression, size limits.
+/// Builds the router of all gRPC services, with authentication, raw request bodies, compression and size limits.
 fn router<H: Health>(
     config: &Config,
     parts: &ServerParts,

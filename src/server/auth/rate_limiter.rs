@@ -102,7 +102,7 @@ impl RateState {
     }
 
     /// Returns how long to sleep before calling again, or `None` if the caller may proceed. `ticket` must be `None` at
-    /// the first call, which stores the number of steps to wait for in it.
+    /// the first call. That call stores the number of steps to wait for in `ticket`.
     fn wait(
         &mut self,
         ticket: &mut Option<f64>,

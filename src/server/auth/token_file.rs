@@ -82,7 +82,7 @@ pub(super) struct ParsedToken {
 pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
     let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
-        // The parser's message may quote a token, so only messages about keys are passed on, which quote none.
+        // The parser's message may quote a token. Messages about keys quote none, so only these messages are passed on.
         let words = error.message();
         let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
         let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };

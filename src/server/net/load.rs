@@ -109,7 +109,8 @@ impl Balance {
         (chosen, ConnectionLoad::new(Arc::clone(&thread.load)))
     }
 
-    /// Adds the work since the last choice to each thread's recent work, as if it had been done at a constant rate.
+    /// Updates each thread's recent work to the time `now`: reduces the weight of older work, and adds the work since
+    /// the last choice of a thread. The added work counts as if the thread had done it at a constant rate.
     fn refresh(&mut self, now: Instant) {
         let windows = (now - self.at).as_secs_f64() / WINDOW.as_secs_f64();
         self.at = now;

@@ -347,8 +347,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         }
     }
 
-    /// Stores a reply to send it, and to send it again if its stream is lost. If the memory budget is exhausted, drops
-    /// the older stored replies.
+    /// Stores a reply for sending. If the stream is lost, the reply can be sent again on another stream. If the memory
+    /// budget is exhausted, drops the older stored replies.
     fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
         let Self { exchange, lease: Some(lease) } = self else { return };
         let stored = &mut lease.stored;

@@ -46,7 +46,7 @@ pub enum Error {
         /// The number of the session's last reply.
         last: u64,
     },
-    /// Some replies after number `got`, which the client needs, are no longer stored.
+    /// The client needs all replies after number `got`, but some of these replies are no longer stored.
     #[error(
         "last_reply is {got}, but replies up to {first} are no longer stored, because more requests were unanswered than \
          open.lease allows, or there was no memory; open another session"

@@ -38,7 +38,7 @@ pub struct Field {
 
 /// The type of a field's entries.
 pub enum FieldKind {
-    /// Messages. The entries of those of their fields that are in this list are counted, too.
+    /// Nested messages. If a field of such a message is in this list, its entries are also counted.
     Fields(&'static [Field]),
     /// Numbers, packed or unpacked.
     Numbers,

@@ -29,7 +29,7 @@ pub struct ReadTimeouts {
     pub rest: Option<Duration>,
 }
 
-/// The response body of a stream, whose reading by the client is watched.
+/// The response body of a stream. The connection ends if the client does not read the body in time.
 pub struct WatchedBody {
     body: Body,
     outbox: PendingReservations,

@@ -157,7 +157,7 @@ pub(super) fn dtype_and_count(tensor: &Tensor) -> Option<(DataType, usize)> {
 
 /// Makes a tensor of this shape. The shape of a scalar is empty.
 pub(super) fn tensor(payload: Payload, shape: &[usize]) -> Tensor {
-    // The shapes come from specs, whose dimensions are at most a few dozen.
+    // A length is at most the size of an observation or of the catalogue, so it fits in an i32.
     let shape = shape.iter().map(|&length| i32::try_from(length).unwrap_or(i32::MAX)).collect();
     Tensor { payload: Some(payload), shape }
 }

@@ -13,7 +13,8 @@ use crate::{
 const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
 /// The maximum encoded length of an integer field with its tag, bytes.
 const MAX_VARINT_FIELD_BYTES: usize = 11;
-/// The estimated memory that an ended episode takes, as a value and encoded in the reply together, bytes.
+/// The estimated memory of an ended episode without a receipt, bytes. The episode is in memory twice: as a value, and
+/// encoded in the reply.
 const EPISODE_END_BYTES: usize = 300;
 /// The estimated memory of an ended or started episode with a receipt, without the receipt's numbers, bytes.
 const RECEIPT_OVERHEAD_BYTES: usize = 400;
@@ -86,7 +87,7 @@ pub fn policy(request: &proto::Act, envs: usize) -> usize {
 /// Returns an upper bound of the length of the reply to an `act`, bytes.
 pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
     let settings = batch.settings();
-    // Actions count twice: as sampled, and as inputs of the policy. The 10 stands for flags, values and the like.
+    // Actions count twice: as sampled, and as inputs of the policy. The 10 covers flags, values and similar numbers.
     let numbers = settings.observation_size() + 2 * action_width(settings) + 10;
     let step = batch.size().saturating_mul(4 * numbers + receipt_bytes(settings));
     step.saturating_mul(request.max_steps).min(MAX_ROLLOUT_BYTES.saturating_add(step))
@@ -142,8 +143,8 @@ pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Envir
     size.saturating_mul(row).saturating_add(FRAMING_BYTES)
 }
 
-/// Returns an upper bound of the length of a reply to `snapshot` of `size` environments, bytes. `snapshot` is the
-/// maximum length of one snapshot.
+/// Returns an upper bound of the length of the reply to a request for snapshots of `size` environments, bytes. Each of
+/// these snapshots has at most `snapshot` bytes.
 pub fn max_snapshot_reply_bytes(size: usize, snapshot: usize) -> usize {
     size.saturating_mul(1 + prost::length_delimiter_len(snapshot) + snapshot).saturating_add(FRAMING_BYTES)
 }
