@@ -37,7 +37,7 @@ DRAWN = [
     "results.html",
 ]
 WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
-# Script that returns whether the search is open, and its results. The search has its own shadow tree.
+# A script that returns whether the search is open, and the number of its results. The search is in a shadow tree.
 SEARCH_STATE = """
 (() => {
   const tree = [...document.querySelectorAll('*')].map(element => element.shadowRoot).find(root => root);

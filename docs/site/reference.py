@@ -19,8 +19,8 @@ PAIRS = [(a, r) for a in ("a2c", "ppo", "epopt-a2c", "epopt-ppo") for r in ("ff"
 PAIRS += [("rl2-a2c", "rc"), ("rl2-ppo", "rc")]
 # Arguments of the training whose defaults are shown.
 GIVEN = {"environment", "architecture"}
-# Policies of results/ that were trained with PPO on D and can be filmed, by the page about their experiment. A step of
-# MountainCar simulates a second.
+# The policies in films: for each page about an experiment, the paths of policies that were trained with PPO on D. {}
+# stands for the environment. A step of MountainCar simulates a second.
 FILMED = {
     "beyond": "results/policies/{}-ppo-ff-D-9bd6546b-s7.safetensors",
     "locomotion": "results/policies/{}-ppo-ff-D-348d15d9-s2.safetensors",
@@ -251,7 +251,7 @@ def settings(programs):
     ):
         rows = []
         for key, words in documented(sources, struct):
-            # Comments have the structs' defaults. The program's own take precedence, but it does not write all of them.
+            # A comment may state a default. It is shown only if config.toml has no value.
             said = re.search(r" \(default: ([^()]*(?:\([^()]*\)[^()]*)*)\)", words)
             words = words.replace(said[0], "") if said else words
             ours, theirs = (
@@ -269,7 +269,7 @@ def of_key(defaults, key):
 
 
 def resolved(programs, preset):
-    """Return the settings of each pair, from the config.toml that a training writes at its start."""
+    """Begin a training with each pair of algorithm and architecture. Return the settings in its config.toml."""
     found = {}
     with tempfile.TemporaryDirectory() as folder:
         trainings = {pair: begin(programs, preset, pair, Path(folder) / "-".join(pair)) for pair in PAIRS}
@@ -279,7 +279,7 @@ def resolved(programs, preset):
                 if training.poll() is not None:
                     raise SystemExit(f"perturb train with {preset} {' '.join(pair)} ended with {training.returncode}")
                 time.sleep(0.02)
-            training.kill()  # asked to stop it would finish its iteration
+            training.kill()  # SIGTERM would let the training finish its iteration
             training.wait()
             found[pair] = dict(line.split(" = ", 1) for line in file.read_text().splitlines() if " = " in line)
     return found
@@ -389,7 +389,8 @@ def python():
     """Return the page of the Python package, from its docstrings."""
     source = Path("python/src/perturb/__init__.py").read_text()
     names = re.findall(r'"(\w+)"', source.split("__all__ = [")[1].split("]")[0])
-    # Each name links to the module that defines it. A module may have the name of its content.
+    # A link needs the module that defines the name, because a function and its module may have the same name, for
+    # example perturb.environments.environments.
     imported = re.findall(r"from \.(\w+) import (?:\((.*?)\)|(.*?)\n)", source, re.DOTALL)
     modules = {name: module for module, several, one in imported for name in re.findall(r"\w+", several or one)}
     inner = re.findall(r"from \. import (\w+)\n", source)

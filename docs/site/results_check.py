@@ -1,4 +1,4 @@
-"""Compare README.md, results/README.md and docs/findings with the results table, and run the commands that they print.
+"""Compare README.md, results/README.md and docs/findings with the results table, and run the commands of these pages.
 
 Usage: results_check.py PROGRAMS [PAGE...]. Fails for a number that the table does not give, a number that no rule
 explains, a policy that is missing, a command that does not work, and a folder that has grown too large.
@@ -35,13 +35,13 @@ PAGES = {
     "docs/findings/recurrent.md": results_pages.recurrent,
     "docs/findings/rl2-trials.md": results_pages.rl2,
 }
-# Of README.md only this section has results.
+# The part of README.md that has results: its first heading, and the first heading after it.
 SECTIONS = {"README.md": ("## The benchmark", "## Install")}
 NUMBER = r"[-−]?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?"
 
 
 def plain(text):
-    """Return text on one line, without emphasis and without empty ends of cells."""
+    """Return text on one line, without bold type."""
     return re.sub(r"\s+", " ", text.replace("**", ""))
 
 
@@ -56,7 +56,7 @@ def prose(page):
 
 
 def pattern(text):
-    """Return an expression for a computed text: ⟨a|b⟩ is either number, `@` any number."""
+    """Return a regular expression for a computed text. ⟨a|b⟩ matches a or b, and `@` matches any number."""
     parts = re.split(r"(⟨[^⟩]*⟩|@)", text)
     number = rf"({NUMBER})"
 
@@ -97,7 +97,7 @@ def check_page(page, studies):
 
 
 def check_policies(frame):
-    """Return policies whose tests have checksums but no file, and files that do not load or that no test has."""
+    """Return the faults of the policy files: missing files, files without a test, and files that do not load."""
     final = frame.groupby(["study", "cell"]).after_episodes.transform("max") == frame.after_episodes
     tested = set(frame[final & frame.checksum.notna()].cell)
     stored = {path.stem: path for path in POLICIES.glob("*.safetensors")}
@@ -112,7 +112,7 @@ def check_policies(frame):
 
 
 def check_files():
-    """Return what is larger than promised."""
+    """Return a fault for each size of results/ that is above its limit."""
     files = [path for path in Path("results").rglob("*") if path.is_file()]
     lines = len(Path("results/README.md").read_text().splitlines())
     sizes = [
@@ -124,7 +124,7 @@ def check_files():
 
 
 def commands(page):
-    """Return the commands in a page's blocks, without comments. README.md's other blocks run in docs-test."""
+    """Return the commands in a page, without comments. `make docs-test` runs the blocks in README.md's other parts."""
     text = Path(page).read_text()
     if page in SECTIONS:
         first, last = SECTIONS[page]

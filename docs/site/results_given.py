@@ -1,8 +1,12 @@
-"""Numbers in pages about results that no result gives, and small versions of the commands that the pages print."""
+"""Rules for pages about results.
+
+`EVERYWHERE` and `GIVEN` match numbers that cannot be computed from results. `SMALL` has the replacements by which the
+commands of the pages run on small inputs.
+"""
 
 RATE = r"\d+e-\d"
 
-# Names, seeds, budgets, levels and settings, in any page.
+# Names, seeds, budgets, levels and settings, on any page.
 EVERYWHERE = [
     r"\b[Ss]eeds? \(?\d+(?:,? (?:to|and) \d+)?",
     r"(?:seed \d \| )+",
@@ -16,7 +20,7 @@ EVERYWHERE = [
     r"confirm-2|search-\w+",
     r"γ of 0\.\d+(?: or 0\.\d+)?",
 ]
-# A comment says where the numbers come from.
+# Each comment says where the numbers below it come from.
 GIVEN = {
     "README.md": [],
     "results/README.md": [
@@ -26,13 +30,13 @@ GIVEN = {
         r"feed-forward policies, 15 000 episodes",
     ],
     "docs/findings/classic-ff.md": [
-        # The plan.
+        # From the plan.
         r"60 configurations",
         r"All 960 cells",
         r"960 cells",
         r"over (?:the same )?20 pairs",
         r"only some 5 % of the episodes",
-        # Audits of cells whose policies are not stored.
+        # From audits of cells whose policies are not stored.
         r"30 episodes of each of 597 policies",
         r"17 910 in all",
         r"18 000 episodes",
@@ -40,17 +44,17 @@ GIVEN = {
         r"a rate of 7e-5",
     ],
     "docs/findings/acrobot-steps.md": [
-        # The plan.
+        # From the plan.
         r"40 trainings",
         r"[DRE], [89]0 \|",
-        # The columns of 80 steps, and the curve over the threshold, are of episodes that are not stored.
+        # From episodes that are not stored: the columns of 80 steps, and the curve over the threshold.
         r"from 73 to 90",
         r"22 to 28 points on D, 20 to 21 on R and 9 to 10 on E",
         r"and 15 steps",
         r"end at 0 %",
     ],
     "docs/findings/beyond.md": [
-        # The plans.
+        # From the plans.
         r"seeds \(7 to 11\), 1 000 test episodes",
         r"with 500 test episodes",
         r"the last 100 episodes",
@@ -58,24 +62,24 @@ GIVEN = {
         r"budget of 15 000",
     ],
     "docs/findings/cart-pole-ties.md": [
-        # The plan.
+        # From the plan.
         r"five seeds \(2 to 6\)",
         r"25 are on R",
         r"only 5 steps for A2C and 128 steps for PPO",
-        # The coverage of bootstrap intervals on normal data, which a test of the statistics measures.
+        # From a test of the statistics: the coverage of bootstrap intervals on normal data.
         r"some 84 % of the cases",
         r"\| after 1 000 episodes: D .* after 15 000: D",
     ],
     "docs/findings/locomotion.md": [
         r"1 000 episodes each",
         r"generates 60 000 episodes",
-        # Audits of cells whose policies are not stored.
+        # From audits of cells whose policies are not stored.
         r"replayed 30 episodes",
     ],
     "docs/findings/paper-claims.md": [
         r"stayed at 0 %",
         r"2 000 to 20 000 steps, and an update of PPO uses 128 steps",
-        # Audits of cells whose policies are not stored.
+        # From audits of cells whose policies are not stored.
         r"replayed 4 800 test episodes of the 160",
     ],
     "docs/findings/pendulum-ppo.md": [
@@ -84,7 +88,7 @@ GIVEN = {
         r"within 2 000",
     ],
     "docs/findings/recurrent.md": [
-        # Audits and repeated trainings of cells whose policies are not stored.
+        # From audits and repeated trainings of cells whose policies are not stored.
         r"all 15 000 test episodes",
         r"900, 510 and 1 380 episodes of 30, 17 and 46",
         r"gave 0\.0 instead of 42\.1 % on D, 79\.0 instead of 83\.8 on R, and 93\.0 instead of 93\.3",
@@ -94,11 +98,12 @@ GIVEN = {
     "docs/findings/rl2-trials.md": [
         r"Trials of 1 and 5 episodes",
         r"rate of 2e-3",
-        # Audits of cells whose policies are not stored.
+        # From audits of cells whose policies are not stored.
         r"replayed 30 episodes of each of these 24",
     ],
 }
-# Pairs of an expression and what a command becomes; the first that matches is taken. SCRATCH is an empty folder.
+# Pairs of a regular expression and the replacement of its match. The first pair that matches a command is used.
+# SCRATCH stands for an empty folder.
 SMALL = [
     (r"^perturb audit results$", "perturb audit results/policies/CartPole-ppo-ff-R-9bd6546b-s7.safetensors"),
     (r"^(perturb report results\S*(?: --selection paper)?) --out \S+", r"\1 --out SCRATCH/report"),

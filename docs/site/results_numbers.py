@@ -12,7 +12,8 @@ from statistics import fmean
 PAPER = Path("crates/records/data/paper_results.csv")
 ENVIRONMENTS = ("CartPole", "Pendulum", "Acrobot", "MountainCar")
 METRICS = ("Default", "Interpolation", "Extrapolation")
-# Choices of random signs for more than 16 pairs, as in the report.
+# A sign-flip test of up to EXACT_PAIRS pairs uses all choices of signs. A test of more pairs draws CHOICES random
+# choices. The report uses the same two numbers.
 CHOICES = 100_000
 EXACT_PAIRS = 16
 
@@ -77,7 +78,7 @@ class Cell:
 
 
 class Studies:
-    """All cells of a table, by their studies."""
+    """The cells of all studies in the results table, and the numbers of the paper."""
 
     def __init__(self, rows):
         blocks = defaultdict(list)
@@ -88,7 +89,7 @@ class Studies:
             self.paper_rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
 
     def finished(self, study, **wanted):
-        """Return the finished cells of a study with these settings or attributes."""
+        """Return the finished cells of a study whose settings or attributes have the values `wanted`."""
 
         def fits(cell, name, value):
             return value == (getattr(cell, name) if hasattr(cell, name) else cell.settings.get(name))
@@ -97,7 +98,7 @@ class Studies:
         return [cell for cell in cells if all(fits(cell, *pair) for pair in wanted.items())]
 
     def planned(self, study):
-        """Return the numbers of cells that are done and that failed."""
+        """Return the number of finished cells and the number of failed cells."""
         cells = [cell for cell in self.cells if cell.study == study]
         return sum(not cell.failed for cell in cells), sum(cell.failed for cell in cells)
 
@@ -131,7 +132,7 @@ class Studies:
         return {seed: metrics(rate(seed)) for seed in seeds}
 
     def tied(self, study, environment, algorithm, trained_on, seed=1):
-        """Return the configurations that the published rule cannot tell apart."""
+        """Return the cells that share the best result under the published rule: the same success and mean return."""
         cells = self.finished(study, environment=environment, algorithm=algorithm, trained_on=trained_on, seed=seed)
         best = max(cell.tests[trained_on][:2] for cell in cells)
         return [cell for cell in cells if cell.tests[trained_on][:2] == best]
@@ -197,7 +198,7 @@ def bootstrap_interval(runs):
 
 
 def sign_flip_p(differences):
-    """Return Fisher's two-sided randomisation test; beyond 16 pairs by random signs."""
+    """Return the p value of Fisher's two-sided randomisation test. More than 16 pairs are tested with random signs."""
     differences = [difference for difference in differences if difference != 0]
     seen = abs(sum(differences)) - 1e-9 * sum(map(abs, differences))
     if len(differences) <= EXACT_PAIRS:
@@ -210,7 +211,7 @@ def sign_flip_p(differences):
 
 
 def holm(p):
-    """Return p values corrected after Holm, in their order."""
+    """Return the p values after Holm's correction, in the order of `p`."""
     corrected, least = [0.0] * len(p), 0.0
     for rank, place in enumerate(sorted(range(len(p)), key=p.__getitem__)):
         least = min(1.0, max(least, p[place] * (len(p) - rank)))

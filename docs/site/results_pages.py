@@ -1,6 +1,6 @@
 """The numbers of README.md, results/README.md and docs/findings.
 
-Each function computes the texts that must stand in a page from the results table.
+For each page a function computes, from the results table, the texts that the page must contain.
 """
 
 import re
@@ -25,7 +25,7 @@ def averages(studies, study, method, seeds):
 
 
 def headline(studies):
-    """Return the rows of the published and the clean rule and the paper's, by the algorithm."""
+    """Return the metrics of each algorithm by the published rule, by the clean rule, and in the paper."""
     rows = {}
     for name, method in FF.items():
         rules = [studies.published_rule("classic-ff", task, name) for task in ENVIRONMENTS]
@@ -37,7 +37,7 @@ def headline(studies):
 
 
 def by_task(studies, study, seeds, methods=FF):
-    """Return the rows of a table by method and task, and the paper's."""
+    """Return the rows of a table of methods and tasks. A row of the paper's numbers follows each method's row."""
     lines = []
     for name, method in methods.items():
         cells, papers = [], []
@@ -81,7 +81,7 @@ def readme(studies):
     return texts
 
 
-# The studies by the beginnings of their rows, with the number of planned cells where some are missing.
+# For the beginning of each row: the study's name, and the number of planned cells if some cells are missing.
 STUDIES = {
     "[classic-ff] |": ("classic-ff", None),
     "[classic-rc] |": ("classic-rc", 360),
@@ -99,7 +99,7 @@ HOURS += ("questions/pendulum", "beyond/search-*", "beyond/confirm-2")
 
 
 def named(studies, name):
-    """Return the studies with this name, or those that begin with it if it ends with `/` or `*`."""
+    """Return the studies called `name`. If `name` ends with `/` or `*`, return the studies that begin with it."""
     known = sorted({cell.study for cell in studies.cells})
     start = name.removesuffix("*")
     return [study for study in known if study == name or (name[-1] in "/*" and study.startswith(start))]
@@ -206,7 +206,7 @@ def acrobot(studies):
             shown = about(fmean(updates))
             if max(updates) > 2 * min(updates):
                 shown = f"{round(min(updates), -4):,.0f} to {round(max(updates), -5):,.0f}".replace(",", " ")
-            # The columns of 80 steps are of episodes that are not stored.
+            # Episodes for the columns of 80 steps are not stored.
             texts.append(
                 Near(
                     f"| {environments} × {length} | {rate} | {shown} | @ ± @ | "
@@ -331,7 +331,7 @@ RECURRENT = {"A2C FF": FF["a2c"], "A2C RC": ("a2c", "rc", None), "PPO FF": FF["p
 
 
 def one_seed(studies, task, method, digits=1, seed=2, trained_on=None):
-    """Return a cell's three metrics, or success on D, R and E of a policy that was trained on one version."""
+    """Return a seed's three metrics, or with `trained_on` the success of the policy trained on this version."""
     if trained_on is None:
         found = studies.by_seed("classic-rc", task, method).get(seed)
     else:
@@ -491,8 +491,8 @@ def locomotion(studies):
     return [*texts, f"**{done} of 72 cells**"]
 
 
-# Margins of the search are over the paper's best averages, those of A2C.
 def margin(studies, numbers):
+    """Return the least difference of the metrics from the paper's averages of A2C, the paper's best method."""
     return min(number - studies.paper_mean(FF["a2c"], metric) for number, metric in zip(numbers, METRICS, strict=True))
 
 

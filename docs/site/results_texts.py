@@ -1,4 +1,4 @@
-"""The numbers in the sentences of docs/findings; `results_pages` has those of the tables."""
+"""Numbers in the sentences of docs/findings. `results_pages` computes the numbers in the tables."""
 
 import json
 from collections import defaultdict
@@ -53,7 +53,7 @@ def claims(studies):
 
 
 def beyond(studies, confirm, first):
-    """Return the sentences; `confirm` are the metrics of confirm-2 by seed, `first` those of the search's first row."""
+    """Return the texts. `confirm` has confirm-2's metrics by seed, `first` the metrics in the search's first row."""
     searched = [cell for cell in studies.cells if cell.study.startswith("beyond/search-")]
     slower = sum(cell.settings["learning_rate"] != 1e-3 for cell in searched)
     gained = [fmean(numbers) - before for numbers, before in zip(confirm, first, strict=True)]
@@ -72,7 +72,7 @@ def beyond(studies, confirm, first):
 
 
 def best_on_pendulum(studies):
-    """Return the best Extrapolation of a configuration with γ of 0.95, over its seeds."""
+    """Return the best mean Extrapolation over seeds among the configurations with γ of 0.95."""
     names = ("n_minibatches", "ent_coef", "num_envs", "n_steps")
     found = defaultdict(dict)
     for cell in studies.finished("beyond/search-pendulum", gamma=0.95):
@@ -93,7 +93,10 @@ def cells_on_d(studies, algorithm, rate, weight=None, **wanted):
 
 
 def first_of_tied(studies, algorithm, seed, order=None):
-    """Return Extrapolation with the first configurations that are best on D and on R, in an order of the grid."""
+    """Return Extrapolation if ties are broken by the grid's order.
+
+    For D and for R, the rule takes the first of the best configurations in this order.
+    """
 
     def first(version):
         wanted = {"algorithm": algorithm, "normalize_observations": True, "trained_on": version, "seed": seed}
@@ -107,7 +110,10 @@ def first_of_tied(studies, algorithm, seed, order=None):
 
 
 def orders(studies):
-    """Return A2C's Extrapolation by the order of the grid: of rates, of weights, and which of them comes first."""
+    """Return A2C's values of Extrapolation under all orders of the grid.
+
+    An order sorts learning rates up or down, entropy weights up or down, and either of these two settings first.
+    """
     numbers = set()
     for rates in (1, -1):
         for weights in (1, -1):

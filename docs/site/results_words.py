@@ -1,4 +1,4 @@
-"""Numbers as the pages write them."""
+"""Formatting of numbers as on the pages."""
 
 import re
 from dataclasses import dataclass
@@ -19,14 +19,18 @@ CLEAN = range(2, 7)
 
 
 def fixed(number, digits=1):
-    """Return a number with so many digits; of a tie, which rounding errors would decide, both: ⟨0.2|0.3⟩."""
+    """Return a number rounded to `digits` decimals.
+
+    If the number is halfway between two rounded numbers, return both, for example ⟨0.2|0.3⟩, because rounding errors
+    would decide between them.
+    """
     texts = [f"{end:.{digits}f}" for end in (number - 1e-9, number + 1e-9)]
     texts = [text.removeprefix("-") if float(text) == 0 else text for text in texts]
     return texts[0] if texts[0] == texts[1] else f"⟨{texts[0]}|{texts[1]}⟩"
 
 
 def fill(text, *values):
-    """Return text with values in the places of `{:.1f}`, `{:.0f}` and `{}`, numbers rounded by `fixed`."""
+    """Return text with values in the places of `{:.1f}`, `{:.0f}` and `{}`. `fixed` rounds the numbers."""
     values = iter(values)
     return re.sub(r"\{(?::\.(\d)f)?\}", lambda place: shown_value(next(values), place.group(1)), text)
 
@@ -41,7 +45,7 @@ def spread(numbers, digits=1):
 
 @dataclass
 class Near:
-    """A text in which numbers stand for each `@`, which may differ from `values` by chance: by at most `tolerance`."""
+    """A text in which each `@` stands for a number. The page's numbers may differ from `values` by `tolerance`."""
 
     text: str
     values: list
@@ -50,19 +54,19 @@ class Near:
 
 @dataclass
 class Pattern:
-    """A regular expression that must be found."""
+    """A regular expression that a page must match."""
 
     expression: str
 
 
 def triple(metrics):
-    """Return the three metrics over seeds in whole percent; a method that never succeeds has plain zeros."""
+    """Return mean ± deviation of the three metrics in whole percent, or plain zeros if the method never succeeds."""
     if not any(any(numbers) for numbers in metrics):
         return "0 / 0 / 0"
     return " / ".join(spread(numbers, 0) for numbers in metrics)
 
 
 def about(number):
-    """Return a large number with thousands apart: whole thousands, or hundreds below 10 000."""
+    """Return a number rounded to thousands, or below 10 000 to hundreds. A space separates the thousands."""
     unit = 1000 if number >= 10_000 else 100
     return f"{round(number / unit) * unit:,}".replace(",", " ")
