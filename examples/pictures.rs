@@ -2,7 +2,7 @@
 //! `cargo run --release --example pictures -- docs/pictures`.
 
 use perturb::{
-    env::{Action, Episodes, Settings, Version},
+    env::{Action, EpisodeSettings, Episodes, Version},
     render::{Renderer, Size},
     tasks,
 };
@@ -27,7 +27,7 @@ async fn main() -> Result<(), Box<dyn Error>> {
     for &(name, state) in SCENES {
         let Ok(spec) = tasks::catalogue().find(name) else { continue }; // built without MuJoCo
         let distributions = spec.distributions(Version::D);
-        let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
+        let settings = EpisodeSettings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
         let mut episodes = Episodes::new((spec.make)()?, settings);
         episodes.begin(Some(state));
         if name == "Pendulum" {

@@ -2,7 +2,7 @@
 //! environment.
 
 /// The coordinates [x, y] of a point, m; y points upwards. An infinite coordinate means the edge of the picture.
-pub type Point = [f64; 2];
+pub type ScenePoint = [f64; 2];
 
 /// A colour: red, green, blue, each 0 … 255.
 pub type Colour = [u8; 3];
@@ -38,9 +38,9 @@ pub enum Scene {
 #[derive(Debug, Clone)]
 pub struct Drawing {
     /// The lower left corner of the rectangle that must be visible.
-    pub low: Point,
+    pub low: ScenePoint,
     /// The upper right corner of the rectangle that must be visible.
-    pub high: Point,
+    pub high: ScenePoint,
     /// The shapes, from back to front.
     pub shapes: Vec<Shape>,
 }
@@ -51,14 +51,14 @@ pub enum Shape {
     /// A filled polygon.
     Polygon {
         /// The corners in order.
-        corners: Vec<Point>,
+        corners: Vec<ScenePoint>,
         /// The colour of the inside.
         colour: Colour,
     },
     /// A filled disc.
     Disc {
         /// The centre.
-        centre: Point,
+        centre: ScenePoint,
         /// The radius, m.
         radius: f64,
         /// The colour of the inside.
@@ -67,7 +67,7 @@ pub enum Shape {
     /// A line through points, with round ends.
     Line {
         /// The points in order.
-        points: Vec<Point>,
+        points: Vec<ScenePoint>,
         /// The width, m.
         width: f64,
         /// The colour of the line.
@@ -76,7 +76,7 @@ pub enum Shape {
     /// A dashed line through points.
     Dashes {
         /// The points in order.
-        points: Vec<Point>,
+        points: Vec<ScenePoint>,
         /// The width of the dashes, m.
         width: f64,
         /// The colour of the dashes.
@@ -113,32 +113,32 @@ pub struct Graph {
 
 impl Drawing {
     /// Makes an empty drawing. At least the rectangle from `low` to `high` will be visible.
-    pub fn new(low: Point, high: Point) -> Self {
+    pub fn new(low: ScenePoint, high: ScenePoint) -> Self {
         Self { low, high, shapes: Vec::new() }
     }
 
     /// Adds a filled polygon.
-    pub fn polygon(&mut self, corners: &[Point], colour: Colour) {
+    pub fn polygon(&mut self, corners: &[ScenePoint], colour: Colour) {
         self.shapes.push(Shape::Polygon { corners: corners.to_vec(), colour });
     }
 
     /// Adds a filled rectangle, given its lower left and upper right corners.
-    pub fn rectangle(&mut self, [x0, y0]: Point, [x1, y1]: Point, colour: Colour) {
+    pub fn rectangle(&mut self, [x0, y0]: ScenePoint, [x1, y1]: ScenePoint, colour: Colour) {
         self.polygon(&[[x0, y0], [x1, y0], [x1, y1], [x0, y1]], colour);
     }
 
     /// Adds a filled disc. `radius` is in m.
-    pub fn disc(&mut self, centre: Point, radius: f64, colour: Colour) {
+    pub fn disc(&mut self, centre: ScenePoint, radius: f64, colour: Colour) {
         self.shapes.push(Shape::Disc { centre, radius, colour });
     }
 
     /// Adds a line through `points`, with round ends. `width` is in m.
-    pub fn line(&mut self, points: &[Point], width: f64, colour: Colour) {
+    pub fn line(&mut self, points: &[ScenePoint], width: f64, colour: Colour) {
         self.shapes.push(Shape::Line { points: points.to_vec(), width, colour });
     }
 
     /// Adds a dashed line through `points`. `width` is in m.
-    pub fn dashes(&mut self, points: &[Point], width: f64, colour: Colour) {
+    pub fn dashes(&mut self, points: &[ScenePoint], width: f64, colour: Colour) {
         self.shapes.push(Shape::Dashes { points: points.to_vec(), width, colour });
     }
 
@@ -153,13 +153,13 @@ impl Drawing {
     }
 
     /// Adds a rod, a thick line with a bright outline that makes it stand out from the background.
-    pub fn rod(&mut self, from: Point, to: Point, width: f64, colour: Colour) {
+    pub fn rod(&mut self, from: ScenePoint, to: ScenePoint, width: f64, colour: Colour) {
         self.line(&[from, to], 1.25 * width, colour::BACKGROUND);
         self.line(&[from, to], width, colour);
     }
 
     /// Adds a joint: a dark disc with a bright centre.
-    pub fn joint(&mut self, at: Point, radius: f64) {
+    pub fn joint(&mut self, at: ScenePoint, radius: f64) {
         self.disc(at, radius, colour::DARK);
         self.disc(at, 0.45 * radius, colour::BACKGROUND);
     }
@@ -167,7 +167,7 @@ impl Drawing {
 
 /// Returns the point at `distance` m from `from`, in the direction `angle`, rad, measured from the x axis.
 #[expect(clippy::disallowed_methods, reason = "a picture need not be the same everywhere")]
-pub fn polar(from: Point, distance: f64, angle: f64) -> Point {
+pub fn polar(from: ScenePoint, distance: f64, angle: f64) -> ScenePoint {
     let (sin, cos) = angle.sin_cos();
     [from[0] + distance * cos, from[1] + distance * sin]
 }

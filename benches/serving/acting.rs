@@ -7,7 +7,7 @@ use super::{
 };
 use perturb::proto;
 use perturb_policy::{
-    ActionKind, Inputs, Normalisers, Player, PolicySpec, Role, StepOutcome, initial_weights,
+    ActionKind, Inputs, Normalisers, Player, PlayerRole, PolicySpec, StepOutcome, initial_weights,
     random::{Purpose, stream},
 };
 use std::time::Instant;
@@ -67,7 +67,7 @@ pub(crate) async fn measure(lstm: Option<usize>) -> Result<(), Failure> {
 
 fn local_player(spec: &PolicySpec, weights: &[f32]) -> Result<Player, Failure> {
     let inputs = Inputs::new(OBSERVATION, ACTION, BATCH, false);
-    let mut player = Player::new(spec, inputs, BATCH, 1, Normalisers::default(), Role::training(SEED));
+    let mut player = Player::new(spec, inputs, BATCH, 1, Normalisers::default(), PlayerRole::training(SEED));
     player.load(weights)?;
     player.begin(&[0.01; BATCH * OBSERVATION], None)?;
     Ok(player)

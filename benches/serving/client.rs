@@ -3,7 +3,7 @@
 use super::Failure;
 use bytes::Bytes;
 use perturb::{
-    env::{ActionSpace, Distribution, EnvironmentSpec},
+    env::{ActionSpec, Distribution, EnvironmentSpec},
     proto, tasks,
 };
 use perturb_protocol::{Address, Connection, Stream as Session};
@@ -135,10 +135,10 @@ impl Client {
         let mut bytes = Vec::with_capacity(4 * self.batch * width(self.spec));
         for _ in 0..self.batch * width(self.spec) {
             match self.spec.action {
-                ActionSpace::Discrete(names) => {
+                ActionSpec::Discrete(names) => {
                     bytes.extend(((self.noise.next() % names.len() as u64) as i32).to_le_bytes());
                 }
-                ActionSpace::Continuous(_) => bytes.extend(self.noise.unit().to_le_bytes()),
+                ActionSpec::Continuous(_) => bytes.extend(self.noise.unit().to_le_bytes()),
             }
         }
         bytes.into()
@@ -148,8 +148,8 @@ impl Client {
 /// Returns the number of elements of an action.
 pub(crate) fn width(spec: &EnvironmentSpec) -> usize {
     match spec.action {
-        ActionSpace::Discrete(_) => 1,
-        ActionSpace::Continuous(channels) => channels.len(),
+        ActionSpec::Discrete(_) => 1,
+        ActionSpec::Continuous(channels) => channels.len(),
     }
 }
 

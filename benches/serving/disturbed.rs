@@ -6,7 +6,7 @@ use super::{
     client::{Client, ServerProcess},
     median,
 };
-use perturb::env::ActionSpace;
+use perturb::env::ActionSpec;
 use perturb::tasks;
 
 /// The number of environments in a batch.
@@ -23,7 +23,7 @@ pub(crate) fn id(name: &str) -> String {
 pub(crate) async fn measure(name: &str) -> Result<(), Failure> {
     let spec = tasks::catalogue().find(name)?;
     let all = [("action_delay", 2.0), ("sensor_delay", 1.0), ("sensor_noise", 0.05), ("action_noise", 0.05)];
-    let values = if let ActionSpace::Discrete(_) = spec.action { &all[..3] } else { &all };
+    let values = if let ActionSpec::Discrete(_) = spec.action { &all[..3] } else { &all };
     let trips = ((ROUND_US / (spec.step_cost * BATCH as f64)) as usize).clamp(20, 2000);
     let server = ServerProcess::server(1)?;
     let mut plain = Client::open(&server.socket, name, BATCH).await?;

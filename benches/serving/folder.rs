@@ -20,7 +20,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb::{
-    env::{Action, Distribution, EnvironmentSpec, Episodes, Parameter, Settings, Version},
+    env::{Action, Distribution, EnvironmentSpec, EpisodeSettings, Episodes, ParameterSpec, Version},
     tasks::folder,
 };
 use perturb_mujoco::{Model, Simulation};
@@ -131,7 +131,7 @@ async fn with_lengths(id: &str, path: &Path) -> Result<(), Failure> {
     let spec = folder::load(path)?.spec();
     let server = ServerProcess::with_flags(2, &["--task".as_ref(), path])?;
     let distributions = |is_drawn: bool| -> Vec<(&str, Distribution)> {
-        let of = |parameter: &Parameter| match parameter.name {
+        let of = |parameter: &ParameterSpec| match parameter.name {
             "thigh_length" if !is_drawn => Distribution::fixed(parameter.default),
             _ => parameter.distribution(Version::R),
         };
@@ -236,7 +236,7 @@ impl Bare {
         let episodes = (0..BATCH as u32)
             .map(|environment_index| {
                 let distributions = spec.distributions(Version::D);
-                let settings = Settings { seed: SEED, environment_index, distributions, episodes_per_trial: 1 };
+                let settings = EpisodeSettings { seed: SEED, environment_index, distributions, episodes_per_trial: 1 };
                 Ok(Episodes::new((spec.make)()?, settings))
             })
             .collect::<Result<Vec<_>, Failure>>()?;

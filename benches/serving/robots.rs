@@ -16,7 +16,7 @@ use crate::{
 };
 use bytes::Bytes;
 use perturb::{
-    env::{Action, EnvironmentSpec, Episodes, Settings, Version},
+    env::{Action, EnvironmentSpec, EpisodeSettings, Episodes, Version},
     scene::{PosedModel, Scene},
     tasks::locomotion::Walker,
 };
@@ -160,7 +160,7 @@ impl LocalEnvironments {
         let environment = |index: usize| {
             let distributions = spec.distributions(Version::D);
             let settings =
-                Settings { seed: SEED, environment_index: index as u32, distributions, episodes_per_trial: 1 };
+                EpisodeSettings { seed: SEED, environment_index: index as u32, distributions, episodes_per_trial: 1 };
             Ok(Episodes::new((spec.make)()?, settings))
         };
         let environments = range.clone().map(environment).collect::<Result<Vec<_>, Failure>>()?;

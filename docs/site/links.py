@@ -19,7 +19,7 @@ DOCUMENTS = [*Path().glob("*.md"), *Path("docs").rglob("*.md")]
 DOCUMENTS += [Path(folder) / "README.md" for folder in ("python", "docker", "results")]
 
 
-class Page(html.parser.HTMLParser):
+class HtmlPage(html.parser.HTMLParser):
     """Anchors and links of an HTML page."""
 
     def __init__(self, text):
@@ -77,7 +77,7 @@ def main():
     # The error page is shown at any address, so its links begin at the root. Reports are not pages of the site.
     pages = [page for page in site.rglob("*.html") if page.name not in ("404.html", "report.html")]
     wrong = []
-    for what, paths, parse in (("documents", DOCUMENTS, Document), ("pages", pages, Page)):
+    for what, paths, parse in (("documents", DOCUMENTS, Document), ("pages", pages, HtmlPage)):
         count, found = broken(paths, parse)
         wrong += found
         print(f"{count} links of {len(paths)} {what}")

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use perturb::env::ActionSpace;
+use perturb::env::ActionSpec;
 use perturb::proto::act::Task;
 use perturb::proto::dm_env_rpc::v1 as rpc;
 use perturb::proto::dm_env_rpc::v1::environment_request::Payload;
@@ -122,8 +122,8 @@ fn sessions(environment: &str) -> [Vec<u8>; 3] {
         ..Open::default()
     }));
     let action = match spec.action {
-        ActionSpace::Discrete(names) => ActionKind::Discrete { n: names.len() },
-        ActionSpace::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
+        ActionSpec::Discrete(names) => ActionKind::Discrete { n: names.len() },
+        ActionSpec::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
     };
     let shape = PolicySpec { observation_size: spec.observation.len(), action, hidden: vec![4], lstm: Some(2) };
     let stream = RandomStream { key: vec![1; 32].into(), ..RandomStream::default() };

@@ -7,8 +7,8 @@
 use std::time::Instant;
 
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{RolloutBuffer, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{ActionKind, Actor, ActorOutput, ObservationNormaliser, PolicySpec};
 use perturb_settings::{A2cConfig, PpoConfig};
@@ -34,8 +34,8 @@ fn time(id: &str, repetitions: usize, mut run: impl FnMut()) {
     println!("{id:40} {:10.2} µs fastest {:10.2} µs median", times[0], times[repetitions / 2]);
 }
 
-fn policy(observation_size: usize, action: ActionKind) -> Policy {
-    Policy::new(PolicySpec::feed_forward(observation_size, action), 1).expect("a policy")
+fn policy(observation_size: usize, action: ActionKind) -> TrainablePolicy {
+    TrainablePolicy::new(PolicySpec::feed_forward(observation_size, action), 1).expect("a policy")
 }
 
 fn observations(size: usize) -> Vec<f32> {
@@ -45,13 +45,13 @@ fn observations(size: usize) -> Vec<f32> {
 
 /// Returns a full rollout of `n_steps` steps in `n_envs` environments: random observations, and the actions that
 /// `policy` chose for them.
-fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
+fn rollout(policy: &TrainablePolicy, n_steps: usize, n_envs: usize) -> RolloutBuffer {
     let spec = policy.spec();
     let mut actor = Actor::new(spec, n_envs);
     actor.load_flat(policy.flat_weights()).expect("weights that fit");
     let mut rng = stream(1, Purpose::Actions);
     let mut acts = ActorOutput::new(spec.action, n_envs);
-    let mut rollout = Rollout::new(n_steps, n_envs, spec.observation_size, spec.action.width());
+    let mut rollout = RolloutBuffer::new(n_steps, n_envs, spec.observation_size, spec.action.width());
     rollout.begin(actor.memory());
     for rows in observations(n_steps * n_envs * spec.observation_size).chunks(n_envs * spec.observation_size) {
         actor.act(rows, &mut rng, &mut acts).expect("actions");
@@ -76,7 +76,7 @@ fn rollout(policy: &Policy, n_steps: usize, n_envs: usize) -> Rollout {
 /// sizes.
 fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
     perturb_torch::register();
-    let mut policy = Policy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");
+    let mut policy = TrainablePolicy::new(PolicySpec::recurrent(observation_size, action), 1).expect("a policy");
     for n_envs in [1, 16] {
         let mut actor = Actor::new(policy.spec(), n_envs);
         actor.load_flat(policy.flat_weights()).expect("weights that fit");
@@ -98,7 +98,7 @@ fn recurrent(task: &str, observation_size: usize, action: ActionKind) {
     }
 }
 
-fn time_a2c(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
+fn time_a2c(id: &str, repetitions: usize, policy: &mut TrainablePolicy, n_steps: usize, n_envs: usize) {
     let rollout = rollout(policy, n_steps, n_envs);
     let config = A2cConfig { n_steps, learning_rate: 1e-6, ..A2cConfig::default() };
     let mut a2c = A2c::new(config, policy).expect("valid settings");
@@ -109,7 +109,7 @@ fn time_a2c(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n
 }
 
 /// Measures one epoch of PPO.
-fn time_ppo(id: &str, repetitions: usize, policy: &mut Policy, n_steps: usize, n_envs: usize) {
+fn time_ppo(id: &str, repetitions: usize, policy: &mut TrainablePolicy, n_steps: usize, n_envs: usize) {
     let rollout = rollout(policy, n_steps, n_envs);
     let config = PpoConfig { n_steps, n_epochs: 1, learning_rate: 1e-6, ..PpoConfig::default() };
     let mut ppo = Ppo::new(config, policy, 1).expect("valid settings");

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Cell, Folder, Measurement, Speed};
+use perturb_experiment::{Cell, ExperimentFolder, Measurement, Speed};
 use perturb_files::interrupt::{Scratch, StopFlag};
 use perturb_files::{FileError, io};
 
@@ -121,7 +121,7 @@ fn measure_one(
         cell
     };
     let cells: Vec<Cell> = group.iter().map(endless).collect();
-    let folder = Folder::new(scratch);
+    let folder = ExperimentFolder::new(scratch);
     let job = |cell| CellJob { cell, folder: folder.cell(&cell.id), retry: None };
     let jobs: Vec<CellJob<'_>> = cells.iter().map(job).collect();
     let enough = StopFlag::default();

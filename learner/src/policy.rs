@@ -10,7 +10,7 @@ use perturb_policy::{
 use crate::error::Result;
 
 /// A trainable policy of either architecture: its P weights, and the backend that computes gradients.
-pub struct Policy {
+pub struct TrainablePolicy {
     spec: PolicySpec,
     /// The weights `[P]`, in the order of [`PolicySpec::layout`]. After a change, [`GradientBackend::weights_changed`]
     /// must be called.
@@ -30,7 +30,7 @@ pub struct GradientWorkspace {
     gradient: Vec<f32>,
 }
 
-impl Policy {
+impl TrainablePolicy {
     /// Returns a policy with initial weights, which `seed` determines to the byte. Weights are orthogonal with gain √2
     /// in hidden layers, 0.01 in the policy's last layer, and 1 in the value function's last layer and in the LSTM.
     /// Biases and log standard deviations are 0.
@@ -40,7 +40,7 @@ impl Policy {
     pub fn new(spec: PolicySpec, seed: u64) -> Result<Self> {
         spec.validate()?;
         let weights = initial_weights(&spec, &mut stream(seed, Purpose::Weights));
-        Policy::from_weights(spec, &weights)
+        TrainablePolicy::from_weights(spec, &weights)
     }
 
     /// Returns a policy with the given weights. Their names and shapes must be those of [`PolicySpec::layout`].
@@ -53,7 +53,7 @@ impl Policy {
         spec.check(weights)?;
         let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.iter().copied()).collect();
         let backend = gradient_backend(&spec, 1)?;
-        Ok(Policy { spec, gradient: vec![0.0; weights.len()], weights, backend, stop: StopFlag::default() })
+        Ok(TrainablePolicy { spec, gradient: vec![0.0; weights.len()], weights, backend, stop: StopFlag::default() })
     }
 
     /// Sets the flag that interrupts updates: if `stop` is raised, an update that would still take long ends with an

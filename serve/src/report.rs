@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use perturb_experiment::Folder;
+use perturb_experiment::ExperimentFolder;
 use perturb_experiment::runs::RunKind;
 use perturb_report::{ReportBundle, ReportError, ReportInputs};
 use tokio::sync::Semaphore;
@@ -167,7 +167,7 @@ impl ReportCache {
 fn build(folder: &Path) -> Result<Arc<str>, String> {
     let mut inputs = ReportInputs::default();
     match RunKind::detect(folder) {
-        Some(RunKind::Experiment) => inputs.folder = Some(Folder::new(folder)),
+        Some(RunKind::Experiment) => inputs.folder = Some(ExperimentFolder::new(folder)),
         _ => inputs.add(folder).map_err(|error| error.to_string())?,
     }
     let page = inputs.read(|whole: ReportBundle<'_>| whole.page().map_err(ReportError::from));

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use perturb_experiment::runs::{LEADS_OUT, LastProgress, RunSummary, TrainingStatus};
-use perturb_experiment::{CellResult, CellState, Folder, FolderError, generated_episodes};
+use perturb_experiment::{CellResult, CellState, ExperimentFolder, FolderError, generated_episodes};
 use perturb_files::{Stamp, is_locked, leads_out};
 use perturb_text::shortened;
 
@@ -144,7 +144,7 @@ impl LiveTraining {
         if let Some(name) = ["result.json", "failure.json"].into_iter().find(|name| leads_out(&self.root, cell, name)) {
             return Some(Err(format!("{name} of the cell is {LEADS_OUT}")));
         }
-        match Folder::new(experiment).cell(cell.file_name()?.to_str()?).state() {
+        match ExperimentFolder::new(experiment).cell(cell.file_name()?.to_str()?).state() {
             Ok(CellState::Done(result)) => Some(Ok(result)),
             Ok(CellState::Failed(failure)) => Some(Err(format!("The cell failed: {}", shortened(failure.reason)))),
             Ok(CellState::Missing) => None,

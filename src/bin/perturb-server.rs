@@ -189,7 +189,7 @@ fn environments(config: &Config, _measured: bool) -> Result<Environments, Failur
 struct Environments {
     catalogue: Catalogue,
     #[cfg(feature = "mujoco")]
-    folders: Vec<folder::Folder>,
+    folders: Vec<folder::TaskFolder>,
     /// The descriptions of the folders' environments, for `--check`.
     #[cfg(feature = "mujoco")]
     reports: Vec<String>,
@@ -197,7 +197,7 @@ struct Environments {
 
 /// Logs once for each folder if its files change. All sessions continue to use the files as they were loaded.
 #[cfg(feature = "mujoco")]
-async fn watch_folders(mut folders: Vec<folder::Folder>) {
+async fn watch_folders(mut folders: Vec<folder::TaskFolder>) {
     const FILES_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_secs(5);
     while !folders.is_empty() {
         tokio::time::sleep(FILES_CHECK_INTERVAL).await;

@@ -1,8 +1,8 @@
 //! The trait that every environment implements, and the description of an environment.
 
 use super::{
-    Action, ActionSpace, Channel, Distribution, Draw, Error, Interval, Parameter, Quantity, RewardTerm, Stream,
-    Success, Version, shorten,
+    Action, ActionSpec, ChannelSpec, Distribution, Draw, Error, Interval, ParameterSpec, PhiloxStream, QuantitySpec,
+    RewardTermSpec, SuccessRuleSpec, Version, shorten,
 };
 use crate::scene::Scene;
 use perturb_protocol::region::Region;
@@ -35,17 +35,17 @@ pub struct EnvironmentSpec {
     /// Creates an environment with default parameters. Fails with [`Error::Model`] if its model cannot be loaded.
     pub make: &'static MakeEnvironment,
     /// The parameters that can be changed.
-    pub parameters: &'static [Parameter],
+    pub parameters: &'static [ParameterSpec],
     /// The entries of an observation, in order.
-    pub observation: &'static [Channel],
+    pub observation: &'static [ChannelSpec],
     /// The actions that the environment accepts.
-    pub action: ActionSpace,
+    pub action: ActionSpec,
     /// The entries of an exact initial state, which clients may set, in order.
-    pub state: &'static [Channel],
+    pub state: &'static [ChannelSpec],
     /// The terms of the reward, in order. The reward is their sum.
-    pub reward_terms: &'static [RewardTerm],
+    pub reward_terms: &'static [RewardTermSpec],
     /// The physical quantities that receipts report, in order. Their values are read back from the simulation.
-    pub applied: &'static [Quantity],
+    pub applied: &'static [QuantitySpec],
     /// The number of steps after which an episode is truncated.
     pub step_limit: u32,
     /// The simulated time of one step, in s.
@@ -56,9 +56,9 @@ pub struct EnvironmentSpec {
     /// The pushes that can be applied to the environment; `None` if it cannot be pushed.
     pub push: Option<PushSpec>,
     /// The success rule of the paper's text.
-    pub success: Success,
+    pub success: SuccessRuleSpec,
     /// The success rule of the paper's published code; `None` if it is the same as `success`.
-    pub code_success: Option<Success>,
+    pub code_success: Option<SuccessRuleSpec>,
     /// The two parameters that heat maps show along x and y by default.
     pub heatmap_axes: Option<[&'static str; 2]>,
 }
@@ -72,14 +72,14 @@ impl fmt::Debug for EnvironmentSpec {
 
 impl EnvironmentSpec {
     /// Returns the distributions of a version, one for each parameter. For R+E returns the distributions of R, then
-    /// those of E, in the layout of [`Settings::distributions`](super::Settings::distributions).
+    /// those of E, in the layout of [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
     pub fn distributions(&self, version: Version) -> Vec<Distribution> {
         let of = |&part: &Version| self.parameters.iter().map(move |parameter| parameter.distribution(part));
         version.parts().iter().flat_map(of).collect()
     }
 
     /// Returns the region of parameter values that can be drawn from `distributions`, which has the layout of
-    /// [`Settings::distributions`](super::Settings::distributions).
+    /// [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
     pub fn region(&self, distributions: &[Distribution]) -> Region {
         let names = || self.parameters.iter().map(|parameter| parameter.name.to_owned());
         let boxes = distributions.chunks(self.parameters.len().max(1));
@@ -91,7 +91,7 @@ impl EnvironmentSpec {
 ///
 /// # Errors
 /// [`Error::OutOfRange`] if it is not, or if an end is NaN.
-pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): (f64, f64)) -> Result<(), Error> {
+pub fn check_bounds(spec: &EnvironmentSpec, parameter: &ParameterSpec, (low, high): (f64, f64)) -> Result<(), Error> {
     let bounds = parameter.bounds;
     if low >= bounds.low && high <= bounds.high {
         return Ok(());
@@ -113,7 +113,7 @@ pub fn check_bounds(spec: &EnvironmentSpec, parameter: &Parameter, (low, high): 
 /// [`Error::OutOfRange`], [`Error::NotWhole`].
 pub fn check_distribution(
     spec: &EnvironmentSpec,
-    parameter: &Parameter,
+    parameter: &ParameterSpec,
     distribution: &Distribution,
 ) -> Result<(), Error> {
     check_bounds(spec, parameter, distribution.range())?;
@@ -127,7 +127,8 @@ pub fn check_distribution(
 }
 
 /// Replaces the distributions of the parameters that `overrides` names, in each box of the parameter space. `base` has
-/// the distributions of one or two boxes, in the layout of [`Settings::distributions`](super::Settings::distributions).
+/// the distributions of one or two boxes, in the layout of
+/// [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
 ///
 /// # Errors
 /// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. After an error, `base` is unchanged.
@@ -203,8 +204,8 @@ pub trait Environment: Send {
     /// choice if the number of choices is odd, otherwise the first choice.
     fn neutral_action(&self, out: &mut [f32]) {
         match self.spec().action {
-            ActionSpace::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
-            ActionSpace::Continuous(channels) => {
+            ActionSpec::Discrete(names) => out.fill(if names.len() % 2 == 1 { (names.len() / 2) as f32 } else { 0.0 }),
+            ActionSpec::Continuous(channels) => {
                 for (entry, channel) in out.iter_mut().zip(channels) {
                     *entry = 0.0_f64.clamp(channel.low, channel.high) as f32;
                 }
@@ -217,7 +218,7 @@ pub trait Environment: Send {
     fn push(&mut self, _impulse: [f64; 3]) {}
 
     /// Begins an episode in a random initial state, drawn from `stream`.
-    fn reset(&mut self, stream: &mut Stream);
+    fn reset(&mut self, stream: &mut PhiloxStream);
 
     /// Begins an episode in the given state, which has the entries of [`EnvironmentSpec::state`]. All entries must be
     /// finite.

@@ -1,13 +1,14 @@
 //! The episodes of one environment: drawing of parameters, step limit, success rules and receipts.
 
 use super::{
-    Achievement, Action, Distribution, Draw, Environment, EnvironmentSpec, Purpose, Stream, seen::SeenParameters,
+    Achievement, Action, Distribution, Draw, DrawPurpose, Environment, EnvironmentSpec, PhiloxStream,
+    seen::SeenParameters,
 };
 use crate::scene::Scene;
 
 /// The settings that determine the episodes of an environment.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Settings {
+pub struct EpisodeSettings {
     /// The seed.
     pub seed: u64,
     /// The environment's index. Seed, index and episode number together determine all random numbers of an episode.
@@ -21,7 +22,7 @@ pub struct Settings {
     pub episodes_per_trial: u32,
 }
 
-/// Maximal number of boxes in [`Settings::distributions`]. Version R+E has two.
+/// Maximal number of boxes in [`EpisodeSettings::distributions`]. Version R+E has two.
 pub(super) const MAX_BOXES: usize = 2;
 
 /// The numbers that identify an episode among all episodes of the same seed.
@@ -39,7 +40,7 @@ pub struct EpisodeId {
 
 /// The physical parameters with which an episode ran.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Receipt {
+pub struct EpisodeReceipt {
     /// The drawn or requested parameters, in the order of [`EnvironmentSpec::parameters`].
     pub requested: Vec<f64>,
     /// The values read back from the physics, in the order of [`EnvironmentSpec::applied`].
@@ -50,16 +51,16 @@ pub struct Receipt {
 
 /// The start of an episode.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EpisodeStart {
+pub struct StartedEpisode {
     /// The numbers that identify the episode.
     pub id: EpisodeId,
     /// The receipt with the episode's parameters, if requested.
-    pub receipt: Option<Receipt>,
+    pub receipt: Option<EpisodeReceipt>,
 }
 
 /// The result of an episode that ended.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EpisodeEnd {
+pub struct FinishedEpisode {
     /// The numbers that identify the episode.
     pub id: EpisodeId,
     /// The undiscounted sum of rewards.
@@ -75,7 +76,7 @@ pub struct EpisodeEnd {
     /// Whether the physics diverged, i.e. the state is not finite.
     pub diverged: bool,
     /// The receipt with the episode's parameters, if requested.
-    pub receipt: Option<Receipt>,
+    pub receipt: Option<EpisodeReceipt>,
 }
 
 /// The result of one step of an episode.
@@ -91,7 +92,7 @@ pub struct Outcome {
 
 /// The counters of an environment: the current trial and episode, and the progress of the episode.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
-pub(super) struct Progress {
+pub(super) struct EpisodeProgress {
     pub(super) trial: u64,
     pub(super) episode: u64,
     pub(super) episode_in_trial: u32,
@@ -112,10 +113,10 @@ pub(super) struct Progress {
 /// An environment that runs one episode after another.
 pub struct Episodes {
     pub(super) environment: Box<dyn Environment>,
-    pub(super) settings: Settings,
+    pub(super) settings: EpisodeSettings,
     /// The parameters of the current trial, in the order of [`EnvironmentSpec::parameters`].
     pub(super) values: Vec<f64>,
-    pub(super) progress: Progress,
+    pub(super) progress: EpisodeProgress,
     /// The parameters at the end of each observation; `None` if observations do not include them.
     pub(super) seen: Option<Box<SeenParameters>>,
 }
@@ -131,19 +132,20 @@ impl Episodes {
     ///
     /// # Panics
     /// If `settings` does not have one distribution for each parameter in each box.
-    pub fn new(environment: Box<dyn Environment>, settings: Settings) -> Self {
+    pub fn new(environment: Box<dyn Environment>, settings: EpisodeSettings) -> Self {
         let n = environment.spec().parameters.len();
         assert!(
             boxes(settings.distributions.len(), n).is_some(),
             "settings.distributions has one distribution for each parameter in each box"
         );
         let values = vec![0.0; n];
-        let mut episodes = Self { environment, settings, values, progress: Progress::default(), seen: None };
+        let mut episodes = Self { environment, settings, values, progress: EpisodeProgress::default(), seen: None };
         episodes.start(None);
         episodes
     }
 
-    /// Makes every observation end with the parameters, scaled by [`Parameter::observed`](super::Parameter::observed).
+    /// Makes every observation end with the parameters, scaled by
+    /// [`ParameterSpec::observed`](super::ParameterSpec::observed).
     pub fn observing_parameters(mut self) -> Self {
         self.seen = Some(Box::new(SeenParameters::new(self.environment.as_ref())));
         self
@@ -155,20 +157,20 @@ impl Episodes {
     }
 
     /// Returns the settings that determine the episodes.
-    pub fn settings(&self) -> &Settings {
+    pub fn settings(&self) -> &EpisodeSettings {
         &self.settings
     }
 
     /// Begins the next episode. If `state` is given, the episode begins in exactly this state, with the entries of
     /// [`EnvironmentSpec::state`].
     pub fn begin(&mut self, state: Option<&[f64]>) {
-        let Progress { trial, episode, episode_in_trial, .. } = self.progress;
+        let EpisodeProgress { trial, episode, episode_in_trial, .. } = self.progress;
         let same_trial = episode_in_trial + 1 < self.settings.episodes_per_trial;
-        self.progress = Progress {
+        self.progress = EpisodeProgress {
             trial: if same_trial { trial } else { trial + 1 },
             episode: episode + 1,
             episode_in_trial: if same_trial { episode_in_trial + 1 } else { 0 },
-            ..Progress::default()
+            ..EpisodeProgress::default()
         };
         self.start(state);
     }
@@ -183,19 +185,22 @@ impl Episodes {
         self.progress = match seed {
             Some(seed) => {
                 self.settings.seed = seed;
-                Progress::default()
+                EpisodeProgress::default()
             }
-            None => {
-                Progress { trial: self.progress.trial + 1, episode: self.progress.episode + 1, ..Progress::default() }
-            }
+            None => EpisodeProgress {
+                trial: self.progress.trial + 1,
+                episode: self.progress.episode + 1,
+                ..EpisodeProgress::default()
+            },
         };
         self.start(state);
     }
 
     fn start(&mut self, state: Option<&[f64]>) {
-        let Settings { seed, environment_index, ref distributions, .. } = self.settings;
+        let EpisodeSettings { seed, environment_index, ref distributions, .. } = self.settings;
         if self.progress.episode_in_trial == 0 {
-            let mut stream = Stream::new(seed, environment_index.into(), Purpose::Parameters, self.progress.trial);
+            let mut stream =
+                PhiloxStream::new(seed, environment_index.into(), DrawPurpose::Parameters, self.progress.trial);
             let n = self.values.len();
             let boxes = boxes(distributions.len(), n).unwrap_or(1);
             // No random number is drawn to choose a single box, so versions D, R and E draw one number for each
@@ -215,7 +220,7 @@ impl Episodes {
         match state {
             Some(state) => self.environment.reset_to(state),
             None => {
-                let mut stream = Stream::new(seed, environment_index.into(), Purpose::InitialState, episode);
+                let mut stream = PhiloxStream::new(seed, environment_index.into(), DrawPurpose::InitialState, episode);
                 self.environment.reset(&mut stream);
             }
         }
@@ -281,15 +286,15 @@ impl Episodes {
 
     /// Returns the numbers that determine the random numbers of the current episode.
     pub fn draw(&self) -> Draw {
-        let Settings { seed, environment_index, .. } = self.settings;
+        let EpisodeSettings { seed, environment_index, .. } = self.settings;
         Draw { seed, environment_index, episode_index: self.progress.episode }
     }
 
     /// Returns the receipt of the current episode.
-    pub fn receipt(&self) -> Receipt {
+    pub fn receipt(&self) -> EpisodeReceipt {
         let mut applied = vec![0.0; self.spec().applied.len()];
         self.environment.applied(&mut applied);
-        Receipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
+        EpisodeReceipt { requested: self.values.clone(), applied, model_hash: self.environment.model_hash().into() }
     }
 
     /// Appends the numbers of the current episode's receipt to `values`: the requested values, then the applied values.
@@ -301,15 +306,15 @@ impl Episodes {
     }
 
     /// Returns the start of the current episode. `receipt` says whether to include the receipt.
-    pub fn started(&self, receipt: bool) -> EpisodeStart {
-        EpisodeStart { id: self.id(), receipt: receipt.then(|| self.receipt()) }
+    pub fn started(&self, receipt: bool) -> StartedEpisode {
+        StartedEpisode { id: self.id(), receipt: receipt.then(|| self.receipt()) }
     }
 
     /// Returns the result of the current episode. `receipt` says whether to include the receipt.
-    pub fn finished(&self, receipt: bool) -> EpisodeEnd {
+    pub fn finished(&self, receipt: bool) -> FinishedEpisode {
         let (progress, spec) = (&self.progress, self.spec());
         let achieved = self.achieved(spec.success.achievement);
-        EpisodeEnd {
+        FinishedEpisode {
             id: self.id(),
             total_reward: progress.total_reward,
             length: progress.length,
@@ -322,7 +327,7 @@ impl Episodes {
     }
 
     fn achieved(&self, achievement: Achievement) -> Option<f64> {
-        let Progress { length, reached_at, held_for, held_longest, .. } = self.progress;
+        let EpisodeProgress { length, reached_at, held_for, held_longest, .. } = self.progress;
         match achievement {
             Achievement::Length => Some(length.into()),
             Achievement::FirstGoal => (reached_at > 0).then_some(reached_at.into()),

@@ -17,13 +17,13 @@ pub use catalogue::Catalogue;
 pub use environment::{
     Environment, EnvironmentSpec, MakeEnvironment, PushSpec, Transition, check_bounds, check_distribution, resolve,
 };
-pub use episode::{EpisodeEnd, EpisodeId, EpisodeStart, Episodes, Outcome, Receipt, Settings};
+pub use episode::{EpisodeId, EpisodeReceipt, EpisodeSettings, Episodes, FinishedEpisode, Outcome, StartedEpisode};
 pub use error::Error;
 pub(crate) use error::shorten;
-pub use parameter::Parameter;
+pub use parameter::ParameterSpec;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
-pub use seeding::{Draw, Purpose, Stream};
+pub use seeding::{Draw, DrawPurpose, PhiloxStream};
 pub(crate) use snapshot::{MAX_SNAPSHOT_BYTES, distributions_bytes};
 pub use snapshot::{SavedDraw, saved_draw};
-pub use spaces::{Action, ActionSpace, Channel, Quantity, RewardTerm};
-pub use success::{Achievement, Comparison, Success};
+pub use spaces::{Action, ActionSpec, ChannelSpec, QuantitySpec, RewardTermSpec};
+pub use success::{Achievement, SuccessComparison, SuccessRuleSpec};

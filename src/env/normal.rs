@@ -1,7 +1,7 @@
 //! Normally distributed random numbers by the ziggurat algorithm with 256 layers (Marsaglia and Tsang, 2000). NumPy
 //! draws the same numbers from the same stream, up to rounding.
 
-use super::Stream;
+use super::PhiloxStream;
 use std::{array, sync::LazyLock};
 
 const N_LAYERS: usize = 256;
@@ -53,7 +53,7 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
     })
 });
 
-impl Stream {
+impl PhiloxStream {
     /// Draws a standard normal number. NumPy's `standard_normal` draws the same number from the same stream, up to
     /// rounding.
     pub fn normal(&mut self) -> f64 {

@@ -5,7 +5,7 @@ use super::{Distribution, Interval, Version};
 /// A physical parameter, with its bounds and the values that versions D, R and E draw. Source: the paper, table of
 /// parameter ranges.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Parameter {
+pub struct ParameterSpec {
     /// The name, unique within the environment.
     pub name: &'static str,
     /// The SI unit, `"1"` if dimensionless.
@@ -27,9 +27,9 @@ pub struct Parameter {
     pub is_integer: bool,
 }
 
-impl Parameter {
+impl ParameterSpec {
     /// Creates a parameter with the physical range `bounds`. The applied quantity of the same name reads it back. Set
-    /// the values of the versions by [`Parameter::versions`] or [`Parameter::off`].
+    /// the values of the versions by [`ParameterSpec::versions`] or [`ParameterSpec::off`].
     pub const fn new(name: &'static str, unit: &'static str, description: &'static str, bounds: (f64, f64)) -> Self {
         let (bounds, none) = (Interval::new(bounds.0, bounds.1), Interval::new(0.0, 0.0));
         Self {
@@ -66,7 +66,7 @@ impl Parameter {
         self
     }
 
-    /// Sets the name of the quantity that reads the parameter back, see [`Parameter::applied`].
+    /// Sets the name of the quantity that reads the parameter back, see [`ParameterSpec::applied`].
     pub const fn read_back_by(mut self, applied: &'static str) -> Self {
         self.applied = applied;
         self
@@ -103,7 +103,7 @@ impl Parameter {
         Interval::new(self.random.low.min(below.low), self.random.high.max(above.high))
     }
 
-    /// Scales a value for observations. The scaling is linear: the ends of [`Parameter::whole`] become -1 and 1. If
+    /// Scales a value for observations. The scaling is linear: the ends of [`ParameterSpec::whole`] become -1 and 1. If
     /// that interval is a single value, returns the difference from it.
     pub fn observed(&self, value: f64) -> f32 {
         let Interval { low, high } = self.whole();
@@ -118,10 +118,10 @@ mod tests {
 
     #[test]
     fn intervals_without_length_are_left_out() {
-        let one_sided = Parameter::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 3.0), (1.0, 5.0));
+        let one_sided = ParameterSpec::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 3.0), (1.0, 5.0));
         let above = Distribution::union(&[Interval::new(3.0, 5.0)]).unwrap();
         assert_eq!(one_sided.distribution(Version::E), above);
-        let fixed = Parameter::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 1.0), (1.0, 1.0));
+        let fixed = ParameterSpec::new("x", "1", "", (0.0, 9.0)).versions(1.0, (1.0, 1.0), (1.0, 1.0));
         for version in [Version::D, Version::R, Version::E, Version::RE] {
             assert_eq!(fixed.distribution(version), Distribution::fixed(1.0), "{version:?}");
         }
@@ -129,12 +129,13 @@ mod tests {
 
     #[test]
     fn observed_parameter_is_linear_within_and_beyond_versions() {
-        let wider_e = Parameter::new("x", "1", "", (0.0, 100.0)).versions(2.0, (1.0, 3.0), (0.5, 4.5));
-        let seen = |p: &Parameter, values: &[f64]| values.iter().map(|&value| p.observed(value)).collect::<Vec<_>>();
+        let wider_e = ParameterSpec::new("x", "1", "", (0.0, 100.0)).versions(2.0, (1.0, 3.0), (0.5, 4.5));
+        let seen =
+            |p: &ParameterSpec, values: &[f64]| values.iter().map(|&value| p.observed(value)).collect::<Vec<_>>();
         assert_eq!(seen(&wider_e, &[0.5, 2.5, 4.5, 0.0, 8.5]), [-1.0, 0.0, 1.0, -1.25, 3.0]);
-        let wider_r = Parameter { random: Interval::new(0.0, 8.0), ..wider_e };
+        let wider_r = ParameterSpec { random: Interval::new(0.0, 8.0), ..wider_e };
         assert_eq!(seen(&wider_r, &[0.0, 4.0, 8.0]), [-1.0, 0.0, 1.0], "R reaches further than E");
-        let single = Parameter::new("x", "1", "", (0.0, 100.0)).versions(2.0, (2.0, 2.0), (2.0, 2.0));
+        let single = ParameterSpec::new("x", "1", "", (0.0, 100.0)).versions(2.0, (2.0, 2.0), (2.0, 2.0));
         assert_eq!(seen(&single, &[2.0, 0.5, 3.0]), [0.0, -1.5, 1.0], "nothing is divided by 0");
     }
 }

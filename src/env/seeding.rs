@@ -24,15 +24,15 @@
 //! | purpose | step | draws, in order |
 //! |---|---|---|
 //! | 2 | of the action, from 0 | a number; if it is below `action_hold`, the last action acts again |
-//! | 3 | of the action, from 0 | a [normal](Stream::normal) number for each entry of the action |
-//! | 4 | of the observation, 0 after a reset | a [normal](Stream::normal) number for each entry of the observation |
+//! | 3 | of the action, from 0 | a [normal](PhiloxStream::normal) number for each entry of the action |
+//! | 4 | of the observation, 0 after a reset | a [normal](PhiloxStream::normal) number for each entry of the observation |
 //! | 5 | of the observation, 0 after a reset | a number for each entry of the observation; if it is below `sensor_dropout`, the entry is lost |
-//! | 6 | of the action, from 0 | a number; if it is below 1 / `push_interval`, there is a push, whose [direction](Stream::direction) is drawn next |
+//! | 6 | of the action, from 0 | a number; if it is below 1 / `push_interval`, there is a push, whose [direction](PhiloxStream::direction) is drawn next |
 //! | 7 | of the action, from 1 | a number; if it is below `change_probability`, the physics change before the step |
 
 /// The purpose of a random stream. Its number is the third word of the Philox counter.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Purpose {
+pub enum DrawPurpose {
     /// Drawing the parameters of a trial.
     Parameters = 0,
     /// Drawing the initial state of an episode.
@@ -68,22 +68,22 @@ const ROUNDS: usize = 10;
 
 /// A stream of random numbers from the Philox generator.
 #[derive(Debug, Clone)]
-pub struct Stream {
+pub struct PhiloxStream {
     key: [u64; 2],
     counter: [u64; 4],
     block: [u64; 4],
     used: usize,
 }
 
-impl Stream {
+impl PhiloxStream {
     /// Creates the stream of an environment for one purpose. `index` is the number of the trial for
-    /// [`Purpose::Parameters`], and the number of the episode for all other purposes.
-    pub fn new(seed: u64, environment_index: u64, purpose: Purpose, index: u64) -> Self {
+    /// [`DrawPurpose::Parameters`], and the number of the episode for all other purposes.
+    pub fn new(seed: u64, environment_index: u64, purpose: DrawPurpose, index: u64) -> Self {
         Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], used: 4 }
     }
 
     /// Creates the stream for step number `step` of an episode.
-    pub fn at_step(draw: &Draw, purpose: Purpose, step: u32) -> Self {
+    pub fn at_step(draw: &Draw, purpose: DrawPurpose, step: u32) -> Self {
         let mut stream = Self::new(draw.seed, draw.environment_index.into(), purpose, draw.episode_index);
         stream.counter[3] = step.into();
         stream

@@ -1,11 +1,11 @@
 //! Observed parameters: the entries that a client may request at the end of each observation.
 
-use super::{Environment, EnvironmentSpec, Parameter};
+use super::{Environment, EnvironmentSpec, ParameterSpec};
 
 /// The current parameters of one environment, scaled for observations.
 pub(super) struct SeenParameters {
     /// Each parameter, and the index in [`EnvironmentSpec::applied`] of the quantity that reads the parameter back.
-    parameters: Vec<(&'static Parameter, usize)>,
+    parameters: Vec<(&'static ParameterSpec, usize)>,
     /// A buffer for the values of [`EnvironmentSpec::applied`].
     applied: Vec<f64>,
     /// The observed entries, one for each parameter.
@@ -16,7 +16,7 @@ impl SeenParameters {
     /// Reads the current parameters of an environment.
     pub(super) fn new(environment: &dyn Environment) -> Self {
         let EnvironmentSpec { parameters, applied, .. } = environment.spec();
-        let place = |parameter: &'static Parameter| {
+        let place = |parameter: &'static ParameterSpec| {
             let place = applied.iter().position(|quantity| quantity.name == parameter.applied);
             (parameter, place.expect("every parameter is read back; a test checks each"))
         };

@@ -1,8 +1,8 @@
 //! Snapshots: the complete state of an environment as bytes, which can be restored in any session, process or server.
 
 use super::{
-    Distribution, Draw, EnvironmentSpec, Episodes, Error, Interval, Settings, check_bounds, check_distribution,
-    episode::{Progress, boxes},
+    Distribution, Draw, EnvironmentSpec, EpisodeSettings, Episodes, Error, Interval, check_bounds, check_distribution,
+    episode::{EpisodeProgress, boxes},
     shorten,
 };
 use serde::{Deserialize, Serialize};
@@ -12,7 +12,7 @@ const FORMAT: u32 = 3;
 /// The last format without a checksum. Later formats end with a checksum: the little-endian CRC-32C of all preceding
 /// bytes.
 const UNSEALED: u32 = 2;
-/// The first format, which has only [`Saved`]. Later formats append [`Progress::held_longest`].
+/// The first format, which has only [`Saved`]. Later formats append [`EpisodeProgress::held_longest`].
 const FIRST: u32 = 1;
 
 /// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
@@ -40,10 +40,10 @@ struct Saved {
     seed: u64,
     environment_index: u32,
     episodes_per_trial: u32,
-    /// For each distribution in [`Settings::distributions`], the ends (low, high) of its intervals.
+    /// For each distribution in [`EpisodeSettings::distributions`], the ends (low, high) of its intervals.
     distributions: Vec<Vec<(f64, f64)>>,
     values: Vec<f64>,
-    progress: Progress,
+    progress: EpisodeProgress,
     state: Vec<f64>,
 }
 
@@ -102,7 +102,7 @@ impl Episodes {
         self.values = saved.values;
         self.see_parameters();
         self.progress = saved.progress;
-        self.settings = Settings {
+        self.settings = EpisodeSettings {
             seed: saved.seed,
             environment_index: saved.environment_index,
             distributions,
@@ -140,7 +140,7 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
 pub struct SavedDraw {
     /// The numbers that determine the environment's random numbers.
     pub draw: Draw,
-    /// The distributions of the environment's parameters, as in [`Settings::distributions`].
+    /// The distributions of the environment's parameters, as in [`EpisodeSettings::distributions`].
     pub distributions: Vec<Distribution>,
     /// The parameters of the current trial, in the order of [`EnvironmentSpec::parameters`]. A client may have forged
     /// them.
@@ -201,8 +201,8 @@ impl Saved {
             return refuse(format!("it does not have the {n} parameters of {}", spec.name));
         }
         let distributions = Self::distributions(spec, &saved)?;
-        let Progress { trial, episode, episode_in_trial, length, total_reward, ended, .. } = saved.progress;
-        let Progress { reached_at, held_for, held_longest, .. } = saved.progress;
+        let EpisodeProgress { trial, episode, episode_in_trial, length, total_reward, ended, .. } = saved.progress;
+        let EpisodeProgress { reached_at, held_for, held_longest, .. } = saved.progress;
         if episode_in_trial >= saved.episodes_per_trial
             || trial > episode
             || episode > MAX_EPISODE

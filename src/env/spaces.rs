@@ -2,7 +2,7 @@
 
 /// A named entry of an observation, action or state vector, with its unit and range.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Channel {
+pub struct ChannelSpec {
     /// The name, unique within the vector.
     pub name: &'static str,
     /// The SI unit, `"1"` if dimensionless.
@@ -17,7 +17,7 @@ pub struct Channel {
     pub scale: f64,
 }
 
-impl Channel {
+impl ChannelSpec {
     /// Creates a channel with this name, unit and range `[low, high]`.
     pub const fn new(name: &'static str, unit: &'static str, low: f64, high: f64) -> Self {
         let scale = if low.is_finite() && high.is_finite() { (high - low) / 2.0 } else { 1.0 };
@@ -38,11 +38,11 @@ impl Channel {
 
 /// The actions that an environment accepts.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum ActionSpace {
+pub enum ActionSpec {
     /// A choice out of n. The list has a name for each choice, which describes its effect.
     Discrete(&'static [&'static str]),
     /// A vector with an entry for each channel. The environment clips the entries to the channels' ranges.
-    Continuous(&'static [Channel]),
+    Continuous(&'static [ChannelSpec]),
 }
 
 /// The action of one environment in one step.
@@ -56,7 +56,7 @@ pub enum Action<'a> {
 
 /// A term of the reward. The reward of a step is the sum of its terms.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct RewardTerm {
+pub struct RewardTermSpec {
     /// The name, unique within the environment.
     pub name: &'static str,
     /// The term's formula, as text.
@@ -65,7 +65,7 @@ pub struct RewardTerm {
 
 /// A physical quantity that is read back from the simulation, such as a mass.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct Quantity {
+pub struct QuantitySpec {
     /// The name, unique within the environment.
     pub name: &'static str,
     /// The SI unit, `"1"` if dimensionless.

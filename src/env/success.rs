@@ -1,18 +1,18 @@
 //! Success rules of episodes.
 
-use super::Quantity;
+use super::QuantitySpec;
 
 /// A success rule: it compares a value that the episode achieved with a threshold. An episode without such a value is
 /// not a success. Source: the paper, section "Experimental methodology".
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Success {
+pub struct SuccessRuleSpec {
     /// The rule, as a sentence.
     pub description: &'static str,
     /// The value that is compared with the threshold.
     pub achievement: Achievement,
     /// The direction of the comparison.
-    pub comparison: Comparison,
-    /// The threshold, in the unit of [`Success::quantity`].
+    pub comparison: SuccessComparison,
+    /// The threshold, in the unit of [`SuccessRuleSpec::quantity`].
     pub threshold: f64,
 }
 
@@ -28,33 +28,33 @@ pub enum Achievement {
     /// The maximal number of consecutive steps after which the task's goal was met.
     LongestGoals,
     /// A quantity of the environment's own, which [`Environment::achieved`](super::Environment::achieved) returns.
-    Own(Quantity),
+    Own(QuantitySpec),
 }
 
 /// The direction in which a success rule compares the achieved value with the threshold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Comparison {
+pub enum SuccessComparison {
     /// An episode succeeds if the achieved value is the threshold or more.
     AtLeast,
     /// An episode succeeds if the achieved value is the threshold or less.
     AtMost,
 }
 
-impl Success {
+impl SuccessRuleSpec {
     /// Returns the name and unit of the compared value.
-    pub const fn quantity(&self) -> Quantity {
+    pub const fn quantity(&self) -> QuantitySpec {
         match self.achievement {
             Achievement::Own(quantity) => quantity,
-            Achievement::LongestGoals => Quantity { name: "steps_in_a_row", unit: "1" },
-            _ => Quantity { name: "steps", unit: "1" },
+            Achievement::LongestGoals => QuantitySpec { name: "steps_in_a_row", unit: "1" },
+            _ => QuantitySpec { name: "steps", unit: "1" },
         }
     }
 
     /// Whether an episode that achieved this value is a success. False for `None`.
     pub fn holds(&self, achieved: Option<f64>) -> bool {
         achieved.is_some_and(|achieved| match self.comparison {
-            Comparison::AtLeast => achieved >= self.threshold,
-            Comparison::AtMost => achieved <= self.threshold,
+            SuccessComparison::AtLeast => achieved >= self.threshold,
+            SuccessComparison::AtMost => achieved <= self.threshold,
         })
     }
 }

@@ -11,14 +11,14 @@ use super::{
         task::{Rollout, RolloutRequest, RolloutTask},
     },
     scheduler::{Pool, StepScheduler},
-    settings::{Autoreset, BatchSettings, SlotGroup},
+    settings::{Autoreset, BatchSettings, SlotGroupSettings},
     shard::{Command, Shard, SlotReset, set_actions},
     step_queue::StepQueue,
     step_result::{ShardOutputs, StepResult, collect},
     sync::lock,
 };
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, EpisodeStart, Episodes, distributions_bytes},
+    env::{Distribution, Draw, EnvironmentSpec, Episodes, StartedEpisode, distributions_bytes},
     meters::Tally,
     scene::Scene,
 };
@@ -90,7 +90,10 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Full`] if the pool has no room, [`Error::Environment`] if a model cannot be loaded.
-    pub async fn open(pool: &Pool, settings: BatchSettings) -> Result<(Self, Bytes, Vec<(u32, EpisodeStart)>), Error> {
+    pub async fn open(
+        pool: &Pool,
+        settings: BatchSettings,
+    ) -> Result<(Self, Bytes, Vec<(u32, StartedEpisode)>), Error> {
         let (workers, size) = (pool.queue(), settings.size());
         let owned = (Arc::new(workers.capacity.reserve(size)?), Arc::new(Tally::new(pool.meter(settings.spec.name))));
         let shard_size = shard_size(settings.spec, size, pool.workers());
@@ -259,7 +262,7 @@ impl Batch {
     ///
     /// # Errors
     /// [`Error::Defect`], if a worker panicked.
-    pub async fn reset(&mut self, entries: Vec<ResetEntry>) -> Result<(Bytes, Vec<(u32, EpisodeStart)>), Error> {
+    pub async fn reset(&mut self, entries: Vec<ResetEntry>) -> Result<(Bytes, Vec<(u32, StartedEpisode)>), Error> {
         self.ready().await?;
         let slots: Vec<usize> = entries.iter().map(|entry| entry.slot).collect();
         let commands = self.split(entries, |entry| entry.slot);
@@ -342,8 +345,8 @@ impl Batch {
     }
 
     /// Waits for the end of a request whose future was dropped before it resolved. Call this method before the next
-    /// request, because workers may still be running the old request. A queued step that has not started is dropped, and a
-    /// rollout ends after its current step.
+    /// request, because workers may still be running the old request. A queued step that has not started is dropped,
+    /// and a rollout ends after its current step.
     pub async fn finish_abandoned(&mut self) {
         // Errors are ignored here: the next request reports them.
         if self.is_running {
@@ -377,7 +380,7 @@ impl Batch {
     /// replaces a distribution by a distribution with more intervals.
     pub fn max_snapshot_bytes(&self) -> usize {
         let own = lock(&self.job.shards[0]).max_snapshot_bytes();
-        let distributions = |group: &SlotGroup| distributions_bytes(&group.episodes.distributions);
+        let distributions = |group: &SlotGroupSettings| distributions_bytes(&group.episodes.distributions);
         let largest = self.settings.groups.iter().map(distributions).max().unwrap_or_default();
         own + largest
     }
@@ -432,8 +435,8 @@ impl Batch {
         lists
     }
 
-    /// Gives each shard a command. `lists` has a list for each shard; `make` makes the command from the shard's first slot
-    /// and its list.
+    /// Gives each shard a command. `lists` has a list for each shard; `make` makes the command from the shard's first
+    /// slot and its list.
     fn command<T>(&self, lists: Vec<Vec<T>>, make: impl Fn(usize, Vec<T>) -> Command) {
         let mut lists = lists.into_iter();
         for shard in &self.job.shards {
@@ -502,13 +505,13 @@ fn job(
 }
 
 /// Divides the slots of `groups` into parts of `size` slots each. The last part may have fewer.
-fn cut(groups: &[SlotGroup], size: usize) -> Vec<Vec<SlotGroup>> {
+fn cut(groups: &[SlotGroupSettings], size: usize) -> Vec<Vec<SlotGroupSettings>> {
     let (mut parts, mut part, mut free_slots) = (Vec::new(), Vec::new(), size);
     for group in groups {
         let mut deferred = group.clone();
         while deferred.size > 0 {
             let taken = deferred.size.min(free_slots);
-            part.push(SlotGroup { size: taken, ..deferred.clone() });
+            part.push(SlotGroupSettings { size: taken, ..deferred.clone() });
             deferred.size -= taken;
             // The index may overflow if no slot of the group remains, but then the index is never used.
             deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);

@@ -29,11 +29,11 @@ mod sync;
 
 pub use batch::{Batch, DropHook, ResetEntry};
 pub use rollout::{
-    policy_runner::{Policy, PolicyRole, PolicyRunner},
-    task::{EndedAt, Rollout, RolloutRequest},
+    policy_runner::{PolicyRole, PolicyRunner, ReceivedPolicy},
+    task::{Rollout, RolloutEpisodeEnd, RolloutRequest},
 };
 pub use scheduler::Pool;
-pub use settings::{Autoreset, BatchSettings, SlotGroup};
+pub use settings::{Autoreset, BatchSettings, SlotGroupSettings};
 pub use step_queue::StepQueue;
 pub use step_result::StepResult;
 

@@ -1,6 +1,6 @@
 //! The settings with which a batch is opened.
 
-use crate::env::{EnvironmentSpec, Settings};
+use crate::env::{EnvironmentSpec, EpisodeSettings};
 
 /// The settings with which a batch of environments is opened.
 #[derive(Debug, Clone)]
@@ -8,7 +8,7 @@ pub struct BatchSettings {
     /// The description of the environment that all slots have.
     pub spec: &'static EnvironmentSpec,
     /// The groups of slots, at least one, in order of slots.
-    pub groups: Vec<SlotGroup>,
+    pub groups: Vec<SlotGroupSettings>,
     /// The autoreset mode, which determines when an environment is reset after the end of an episode.
     pub autoreset: Autoreset,
     /// Whether the starts and ends of episodes are reported with receipts.
@@ -23,13 +23,13 @@ pub struct BatchSettings {
 
 /// A number of successive slots whose episodes have the same settings.
 #[derive(Debug, Clone)]
-pub struct SlotGroup {
+pub struct SlotGroupSettings {
     /// The number of slots, at least 1.
     pub size: usize,
     /// The settings of the group's episodes. These settings determine all randomness. `environment_index` is the
     /// environment index of the group's first slot. The next slots have the next indices; the last index must fit a
     /// u32.
-    pub episodes: Settings,
+    pub episodes: EpisodeSettings,
 }
 
 impl BatchSettings {

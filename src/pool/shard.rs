@@ -2,12 +2,13 @@
 
 use super::{
     receipts::ReceiptColumns,
-    settings::{Autoreset, BatchSettings, SlotGroup},
+    settings::{Autoreset, BatchSettings, SlotGroupSettings},
     sync::lock,
 };
 use crate::{
     env::{
-        self, Action, ActionSpace, Distribution, Draw, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings,
+        self, Action, ActionSpec, Distribution, Draw, EnvironmentSpec, EpisodeSettings, Episodes, FinishedEpisode,
+        StartedEpisode,
     },
     scene::Scene,
 };
@@ -49,7 +50,7 @@ pub(super) struct Shard {
     pub(super) size: usize,
     spec: &'static EnvironmentSpec,
     /// The groups of slots whose environments [`Command::Open`] creates.
-    groups: Vec<SlotGroup>,
+    groups: Vec<SlotGroupSettings>,
     autoreset: Autoreset,
     receipts: bool,
     receipt_arrays: bool,
@@ -76,10 +77,10 @@ pub(super) struct Shard {
     /// The last observations of the episodes in `ended`, `[k, O]`.
     pub(super) final_observations: Vec<f32>,
     /// The episodes that ended in the last command, `[k]`, each with its slot in the batch.
-    pub(super) ended: Vec<(u32, EpisodeEnd)>,
+    pub(super) ended: Vec<(u32, FinishedEpisode)>,
     /// The episodes that began in the last command, each with its slot in the batch. Empty without receipts, and also
     /// after a step if receipts are arrays.
-    pub(super) started: Vec<(u32, EpisodeStart)>,
+    pub(super) started: Vec<(u32, StartedEpisode)>,
     /// The receipts of the episodes in `ended`, if receipts are arrays.
     pub(super) ended_receipts: ReceiptColumns,
     /// The receipts of the episodes that began in the last step, if receipts are arrays.
@@ -92,7 +93,7 @@ pub(super) struct Shard {
 impl Shard {
     /// Makes a shard for the slots of `groups`. `first_slot` is its first slot in the batch. [`Command::Open`] creates
     /// the environments later.
-    pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroup>, first_slot: usize) -> Self {
+    pub(super) fn new(settings: &BatchSettings, groups: Vec<SlotGroupSettings>, first_slot: usize) -> Self {
         let size = groups.iter().map(|group| group.size).sum();
         Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
@@ -107,8 +108,8 @@ impl Shard {
         let BatchSettings { spec, autoreset, receipts, receipt_arrays, observe_parameters, .. } = *settings;
         let observation_size = settings.observation_size();
         let (choices, vectors) = match spec.action {
-            ActionSpace::Discrete(_) => (size, 0),
-            ActionSpace::Continuous(channels) => (0, size * channels.len()),
+            ActionSpec::Discrete(_) => (size, 0),
+            ActionSpec::Continuous(channels) => (0, size * channels.len()),
         };
         let mut shard = Self {
             first_slot,
@@ -216,7 +217,7 @@ impl Shard {
                         // The sum cannot overflow, because the group's last index was checked when the batch was
                         // opened.
                         let environment_index = group.episodes.environment_index + i as u32;
-                        let settings = Settings { environment_index, ..group.episodes.clone() };
+                        let settings = EpisodeSettings { environment_index, ..group.episodes.clone() };
                         let episodes = Episodes::new(environment, settings);
                         let seen = self.observe_parameters;
                         self.slots.push(if seen { episodes.observing_parameters() } else { episodes });
@@ -252,8 +253,8 @@ impl Shard {
                 continue;
             }
             let action = match self.spec.action {
-                ActionSpace::Discrete(_) => Action::Discrete(self.choices[slot]),
-                ActionSpace::Continuous(a) => Action::Continuous(&self.vectors[slot * a.len()..][..a.len()]),
+                ActionSpec::Discrete(_) => Action::Discrete(self.choices[slot]),
+                ActionSpec::Continuous(a) => Action::Continuous(&self.vectors[slot * a.len()..][..a.len()]),
             };
             let outcome = episodes.step(action, &mut self.terms);
             steps += 1;

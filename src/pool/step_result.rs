@@ -6,7 +6,7 @@ use super::{
     shard::Shard,
     sync::lock,
 };
-use crate::env::{EpisodeEnd, EpisodeStart};
+use crate::env::{FinishedEpisode, StartedEpisode};
 use bytes::{Bytes, BytesMut};
 use std::sync::Mutex;
 
@@ -26,9 +26,9 @@ pub struct StepResult {
     /// The last observations of the episodes that ended, f32 `[K, O]`.
     pub final_observations: Bytes,
     /// The K episodes that ended, each with its slot, in order of slots.
-    pub ended: Vec<(u32, EpisodeEnd)>,
+    pub ended: Vec<(u32, FinishedEpisode)>,
     /// The episodes that autoreset began, each with its slot. Empty unless receipts are sent as messages.
-    pub started: Vec<(u32, EpisodeStart)>,
+    pub started: Vec<(u32, StartedEpisode)>,
     /// The M episodes whose receipts `receipt_values` has, u64 `[M, 5]`. Empty unless receipts are sent as arrays.
     /// Columns: slot, environment index, trial index, episode index, number within the trial. The K ended episodes come
     /// before the episodes that began.

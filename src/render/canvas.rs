@@ -1,7 +1,7 @@
 //! Draws the shapes of a [`Drawing`], whose coordinates are in m, as anti-aliased pixels. Uses the library tiny-skia.
 
 use super::Size;
-use crate::scene::{Colour, Drawing, Graph, Point, Shape, colour};
+use crate::scene::{Colour, Drawing, Graph, ScenePoint, Shape, colour};
 use tiny_skia::{Color, FillRule, LineCap, LineJoin, Paint, Path, PathBuilder, Pixmap, Stroke, StrokeDash, Transform};
 
 /// Number of straight segments by which the graph of a function is drawn.
@@ -27,15 +27,15 @@ struct Canvas {
     /// Number of pixels per metre.
     scale: f64,
     /// The lower left corner of the picture, in m.
-    low: Point,
+    low: ScenePoint,
     /// The upper right corner of the picture, in m.
-    high: Point,
+    high: ScenePoint,
 }
 
 impl Canvas {
     /// Creates a blank picture. The rectangle from `low` to `high` is in the middle of the picture, and as large as
     /// fits.
-    fn new(size: Size, low: Point, high: Point) -> Self {
+    fn new(size: Size, low: ScenePoint, high: ScenePoint) -> Self {
         let (width, height) = (f64::from(size.width), f64::from(size.height));
         let mut pixmap = Pixmap::new(size.width.into(), size.height.into()).expect("sizes are at least 16");
         pixmap.fill(paint(colour::BACKGROUND));
@@ -67,7 +67,7 @@ impl Canvas {
         }
     }
 
-    fn stroke(&mut self, points: &[Point], width: f64, colour: Colour, dash: Option<StrokeDash>) {
+    fn stroke(&mut self, points: &[ScenePoint], width: f64, colour: Colour, dash: Option<StrokeDash>) {
         let Some(path) = self.path(points, false) else { return };
         let width = self.pixels(width);
         let line_cap = if dash.is_some() { LineCap::Butt } else { LineCap::Round };
@@ -80,7 +80,7 @@ impl Canvas {
         self.pixmap.fill_path(&path, &solid(colour), FillRule::Winding, Transform::identity(), None);
     }
 
-    fn path(&self, points: &[Point], close: bool) -> Option<Path> {
+    fn path(&self, points: &[ScenePoint], close: bool) -> Option<Path> {
         let mut builder = PathBuilder::new();
         for (i, &point) in points.iter().enumerate() {
             let (x, y) = self.pixel(point);
@@ -92,7 +92,7 @@ impl Canvas {
         builder.finish()
     }
 
-    fn pixel(&self, [x, y]: Point) -> (f32, f32) {
+    fn pixel(&self, [x, y]: ScenePoint) -> (f32, f32) {
         let clamp = |pixels: f64| pixels.clamp(-FAR, FAR) as f32;
         let (x, y) = (self.within(0, x), self.within(1, y));
         (clamp((x - self.low[0]) * self.scale), clamp((self.high[1] - y) * self.scale))
@@ -113,7 +113,7 @@ impl Canvas {
         }
     }
 
-    fn points(&self, Graph { height, from, to }: Graph) -> Vec<Point> {
+    fn points(&self, Graph { height, from, to }: Graph) -> Vec<ScenePoint> {
         let to = self.within(0, to);
         let x = |i: usize| from + (to - from) * i as f64 / SMOOTH as f64;
         (0..=SMOOTH).map(x).map(|x| [x, height(x)]).collect()

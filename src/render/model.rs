@@ -7,7 +7,7 @@
 
 use super::{Error, Size};
 use crate::scene::{Look, ModelView, PosedModel, Scenery};
-use perturb_mujoco::{self as mujoco, Camera, Kind};
+use perturb_mujoco::{self as mujoco, Camera, ElementKind};
 use std::ptr;
 
 const END_OF_MODEL: &str = "</mujoco>";
@@ -26,7 +26,7 @@ pub(super) struct Models {
 /// A model with its scenery, ready to be drawn.
 struct ShownModel {
     look: &'static Look,
-    renderer: mujoco::Renderer,
+    renderer: mujoco::ModelRenderer,
     /// The MJCF with edited lengths that the renderer now shows; `None` for the lengths of `look`.
     edited: Option<String>,
     /// The body that the camera follows, and its position in the model's initial pose, in m. `None` if the camera
@@ -82,18 +82,18 @@ impl ShownModel {
         let scenery = look.scenery.map_or("", |scenery| scenery.mjcf);
         let model = mujoco::Model::from_files(&format!("{own}{scenery}{END_OF_MODEL}"), &files)?;
         let followed = match look.view {
-            ModelView::Beside { followed, .. } => Some(model.id(Kind::Body, followed)?),
+            ModelView::Beside { followed, .. } => Some(model.id(ElementKind::Body, followed)?),
             ModelView::Placed { followed, .. } => followed,
             ModelView::Camera(_) => None,
         };
         let mut painted = Vec::new();
         if let Some(Scenery { hidden, colours, .. }) = look.scenery {
             for (geom, rgb) in colours {
-                painted.push((model.id(Kind::Geom, geom)?, *rgb, 1.0));
+                painted.push((model.id(ElementKind::Geom, geom)?, *rgb, 1.0));
             }
-            painted.push((model.id(Kind::Geom, hidden)?, [0.0; 3], 0.0));
+            painted.push((model.id(ElementKind::Geom, hidden)?, [0.0; 3], 0.0));
         }
-        let mut renderer = mujoco::Renderer::new(model, (size.width, size.height))?;
+        let mut renderer = mujoco::ModelRenderer::new(model, (size.width, size.height))?;
         let simulation = renderer.simulation();
         let followed = followed.map(|body| (body, simulation.xpos(body)));
         let rgba = simulation.geom_rgba_mut();

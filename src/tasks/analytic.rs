@@ -2,7 +2,7 @@
 //! formulas are those of Gymnasium 1.4, computed in f64. Sine and cosine come from the crate libm, because the C
 //! library's results differ in the last digits between processors.
 
-use crate::env::{Action, Error, Stream};
+use crate::env::{Action, Error, PhiloxStream};
 
 /// Returns the index of the choice in an action. The caller must have checked that the action is a valid choice.
 pub(super) fn choice(action: Action<'_>) -> u32 {
@@ -38,6 +38,6 @@ pub(super) fn load<const N: usize>(state: &[f64], most: [f64; N]) -> Result<[f64
 }
 
 /// Draws a state whose entries are independent and uniform in [low, high).
-pub(super) fn draw<const N: usize>(stream: &mut Stream, low: f64, high: f64) -> [f64; N] {
+pub(super) fn draw<const N: usize>(stream: &mut PhiloxStream, low: f64, high: f64) -> [f64; N] {
     std::array::from_fn(|_| stream.uniform(low, high))
 }

@@ -3,8 +3,8 @@
 use crate::common::{self, action_bytes, episodes, observe, play, settings, start_line, step};
 use perturb::{
     env::{
-        self, ActionSpace, Channel, Comparison, Distribution, EnvironmentSpec, Episodes, Error, Parameter, Purpose,
-        Stream, Success, Version,
+        self, ActionSpec, ChannelSpec, Distribution, DrawPurpose, EnvironmentSpec, Episodes, Error, ParameterSpec,
+        PhiloxStream, SuccessComparison, SuccessRuleSpec, Version,
     },
     tasks,
 };
@@ -19,7 +19,7 @@ fn unique<'a>(names: impl Iterator<Item = &'a str>) -> bool {
 
 /// Returns a legal initial state of the environment: near the origin, within the ranges of the channels.
 fn some_state(spec: &EnvironmentSpec, seed: u64) -> Vec<f64> {
-    let mut stream = Stream::new(seed, 0, Purpose::InitialState, 0);
+    let mut stream = PhiloxStream::new(seed, 0, DrawPurpose::InitialState, 0);
     spec.state.iter().map(|c| stream.uniform(c.low.max(-0.05), c.high.min(0.05))).collect()
 }
 
@@ -65,8 +65,8 @@ fn specs_are_complete_and_consistent() {
         }
         assert!(spec.applied.len() >= spec.parameters.len(), "{name}: every parameter can be read back");
         match spec.action {
-            ActionSpace::Discrete(names) => assert!(names.len() >= 2 && unique(names.iter().copied()), "{name}"),
-            ActionSpace::Continuous(channels) => {
+            ActionSpec::Discrete(names) => assert!(names.len() >= 2 && unique(names.iter().copied()), "{name}"),
+            ActionSpec::Continuous(channels) => {
                 assert!(!channels.is_empty() && unique(channels.iter().map(|c| c.name)), "{name}");
                 assert!(channels.iter().all(|c| c.low.is_finite() && c.high.is_finite()), "{name}: bounded actions");
             }
@@ -91,16 +91,16 @@ fn specs_are_complete_and_consistent() {
 #[test]
 fn limits_and_success_rules_are_the_documents() {
     let document = [
-        ("CartPole", 200, "steps", Comparison::AtLeast, 195.0),
-        ("MountainCar", 200, "steps", Comparison::AtMost, 110.0),
-        ("Acrobot", 500, "steps", Comparison::AtMost, 80.0),
-        ("Pendulum", 200, "steps", Comparison::AtLeast, 100.0),
-        ("HalfCheetah", 1000, "distance", Comparison::AtLeast, 20.0),
-        ("Hopper", 1000, "distance", Comparison::AtLeast, 20.0),
+        ("CartPole", 200, "steps", SuccessComparison::AtLeast, 195.0),
+        ("MountainCar", 200, "steps", SuccessComparison::AtMost, 110.0),
+        ("Acrobot", 500, "steps", SuccessComparison::AtMost, 80.0),
+        ("Pendulum", 200, "steps", SuccessComparison::AtLeast, 100.0),
+        ("HalfCheetah", 1000, "distance", SuccessComparison::AtLeast, 20.0),
+        ("Hopper", 1000, "distance", SuccessComparison::AtLeast, 20.0),
     ];
     for spec in tasks::catalogue().specs() {
         let row = document.iter().find(|row| row.0 == spec.name).unwrap();
-        let Success { comparison, threshold, .. } = spec.success;
+        let SuccessRuleSpec { comparison, threshold, .. } = spec.success;
         assert_eq!((spec.name, spec.step_limit, spec.success.quantity().name, comparison, threshold), *row);
     }
 }
@@ -117,8 +117,8 @@ fn success_is_what_was_achieved_compared_with_the_threshold() {
                 step(&mut e, &action_bytes(spec, index.into(), t));
                 let end = e.finished(false);
                 let success = end.achieved.is_some_and(|achieved| match spec.success.comparison {
-                    Comparison::AtLeast => achieved >= spec.success.threshold,
-                    Comparison::AtMost => achieved <= spec.success.threshold,
+                    SuccessComparison::AtLeast => achieved >= spec.success.threshold,
+                    SuccessComparison::AtMost => achieved <= spec.success.threshold,
                 });
                 assert_eq!(end.success, success, "{}: {end:?}", spec.name);
             }
@@ -137,10 +137,10 @@ fn every_parameter_is_read_back_from_the_physics() {
             .map(|p| spec.applied.iter().position(|q| (q.name, q.unit) == (p.applied, p.unit)).expect(p.name))
             .collect();
         let mut environment = (spec.make)().unwrap();
-        let mut stream = Stream::new(3, 0, Purpose::Parameters, 0);
+        let mut stream = PhiloxStream::new(3, 0, DrawPurpose::Parameters, 0);
         let mut applied = vec![f64::NAN; spec.applied.len()];
         for i in 0..300 {
-            let mut draw = |p: &Parameter| match i % 3 {
+            let mut draw = |p: &ParameterSpec| match i % 3 {
                 0 => p.distribution(VERSIONS[i / 3 % 3]).at(stream.unit()),
                 1 => stream.uniform(p.bounds.low, p.bounds.high),
                 _ => [p.bounds.low, p.bounds.high, p.default][(4.0 * stream.unit()) as usize % 3],
@@ -166,7 +166,7 @@ fn observations_and_rewards_keep_to_the_spec() {
                     e.begin(None);
                 }
                 let check = |e: &Episodes| {
-                    for (value, Channel { name, low, high, .. }) in observe(e).into_iter().zip(spec.observation) {
+                    for (value, ChannelSpec { name, low, high, .. }) in observe(e).into_iter().zip(spec.observation) {
                         let range = *low as f32..=*high as f32;
                         assert!(value.is_finite() && range.contains(&value), "{} {name}: {value}", spec.name);
                     }
@@ -416,7 +416,7 @@ fn every_parameter_changes_the_receipt_and_the_physics() {
                 Distribution::fixed(if edited == Some(i) { p.extreme[1].high } else { p.default })
             };
             let distributions = (0..spec.parameters.len()).map(value).collect();
-            let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
+            let settings = env::EpisodeSettings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             let applied = e.receipt().applied;
             // 40 steps are enough for an effect of every parameter, also through contacts with the floor.
@@ -486,7 +486,7 @@ fn everything_stays_finite_at_the_corners_of_the_bounds() {
                 Distribution::fixed(if ends >> i & 1 == 1 { bounds.high } else { bounds.low })
             };
             let distributions = (0..spec.parameters.len()).map(corner).collect();
-            let settings = env::Settings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
+            let settings = env::EpisodeSettings { distributions, ..settings(spec, Version::D, 1, 0, 1) };
             let mut e = Episodes::new((spec.make)().unwrap(), settings);
             for t in 0..600 {
                 let (outcome, terms) = step(&mut e, &action_bytes(spec, 2, t));

@@ -4,8 +4,8 @@
 use crate::common;
 use perturb::{
     env::{
-        self, Distribution, EnvironmentSpec, Error, Interval, Parameter, Purpose, Stream, Version, check_bounds,
-        resolve,
+        self, Distribution, DrawPurpose, EnvironmentSpec, Error, Interval, ParameterSpec, PhiloxStream, Version,
+        check_bounds, resolve,
     },
     tasks,
 };
@@ -43,7 +43,7 @@ const SIGMAS: f64 = 5.0;
 /// 9e-7.
 const KOLMOGOROV_SMIRNOV: f64 = 2.7;
 
-fn all_parameters() -> Vec<(&'static str, &'static Parameter)> {
+fn all_parameters() -> Vec<(&'static str, &'static ParameterSpec)> {
     let catalogue = tasks::catalogue();
     catalogue.specs().flat_map(|spec| spec.parameters.iter().map(|parameter| (spec.name, parameter))).collect()
 }
@@ -173,7 +173,7 @@ fn parameters_are_drawn_independently() {
 fn a_union_of_three_draws_each_in_proportion() {
     let intervals = [Interval::new(-1.0, 0.0), Interval::new(2.0, 5.0), Interval::new(5.0, 11.0)];
     let distribution = Distribution::union(&intervals).unwrap();
-    let mut stream = Stream::new(7, 0, Purpose::Parameters, 0);
+    let mut stream = PhiloxStream::new(7, 0, DrawPurpose::Parameters, 0);
     let n = 20_000;
     let values: Vec<f64> = (0..n).map(|_| distribution.at(stream.unit())).collect();
     for (interval, share) in intervals.into_iter().zip([0.1, 0.3, 0.6]) {
@@ -192,7 +192,7 @@ fn overrides_replace_only_what_they_name() {
     resolve(spec, &mut distributions, overrides).unwrap();
     assert_eq!(distributions, [Distribution::fixed(7.0), spec.parameters[1].distribution(Version::R), union]);
 
-    let settings = env::Settings { distributions, ..common::settings(spec, Version::R, 5, 0, 1) };
+    let settings = env::EpisodeSettings { distributions, ..common::settings(spec, Version::R, 5, 0, 1) };
     let mut episodes = env::Episodes::new((spec.make)().unwrap(), settings);
     let mut lengths = Vec::new();
     for _ in 0..50 {
@@ -222,7 +222,7 @@ fn trial_of_r_and_e_is_all_of_one_of_them() {
     for spec in tasks::catalogue().specs() {
         let mut of_r = 0;
         for (trial, got) in (1..).zip(drawn(spec, Version::RE)) {
-            let mut stream = Stream::new(2026, 3, Purpose::Parameters, trial);
+            let mut stream = PhiloxStream::new(2026, 3, DrawPurpose::Parameters, trial);
             let part = if stream.unit() < 0.5 { Version::R } else { Version::E };
             let expected: Vec<f64> = spec.parameters.iter().map(|p| p.distribution(part).at(stream.unit())).collect();
             assert_eq!(got, expected, "{} trial {trial}, {part}", spec.name);

@@ -10,7 +10,7 @@ use crate::{
 use bytes::Bytes;
 use perturb::{
     env::{EnvironmentSpec, Version},
-    pool::{Autoreset, Batch, BatchSettings, Error, Pool, SlotGroup, StepResult},
+    pool::{Autoreset, Batch, BatchSettings, Error, Pool, SlotGroupSettings, StepResult},
     proto::{AutoresetMode, Open, SessionResponse, Snapshot, session_request::Request},
     tasks,
 };
@@ -29,7 +29,7 @@ fn acrobots(autoreset: Autoreset) -> BatchSettings {
 }
 
 fn settings(spec: &'static EnvironmentSpec, autoreset: Autoreset) -> BatchSettings {
-    let groups = vec![SlotGroup { size: N, episodes: common::settings(spec, Version::R, 17, 100, 2) }];
+    let groups = vec![SlotGroupSettings { size: N, episodes: common::settings(spec, Version::R, 17, 100, 2) }];
     let (receipts, reward_terms) = (true, true);
     BatchSettings { spec, groups, autoreset, receipts, receipt_arrays: false, reward_terms, observe_parameters: false }
 }

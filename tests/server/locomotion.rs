@@ -2,17 +2,17 @@
 
 use crate::common::{episodes, step};
 use perturb::{
-    env::{Action, ActionSpace, Environment, Purpose, Stream, Version},
+    env::{Action, ActionSpec, DrawPurpose, Environment, PhiloxStream, Version},
     tasks::{half_cheetah::half_cheetah, hopper::hopper, locomotion::Walker},
 };
-use perturb_mujoco::{Kind, Model, Simulation};
+use perturb_mujoco::{ElementKind, Model, Simulation};
 use rstest::rstest;
 
 type Make = fn() -> Walker;
 const ROBOTS: [Make; 2] = [|| hopper().unwrap(), || half_cheetah().unwrap()];
 
-fn stream(index: u64) -> Stream {
-    Stream::new(7, 0, Purpose::InitialState, index)
+fn stream(index: u64) -> PhiloxStream {
+    PhiloxStream::new(7, 0, DrawPurpose::InitialState, index)
 }
 
 /// Returns a copy of the simulated model.
@@ -22,8 +22,8 @@ fn model(walker: &Walker) -> Model {
 
 fn n_actions(walker: &Walker) -> usize {
     match walker.spec().action {
-        ActionSpace::Continuous(channels) => channels.len(),
-        ActionSpace::Discrete(_) => panic!("walkers have motors"),
+        ActionSpec::Continuous(channels) => channels.len(),
+        ActionSpec::Discrete(_) => panic!("walkers have motors"),
     }
 }
 
@@ -55,7 +55,7 @@ enum Actions {
 }
 
 impl Actions {
-    fn draw(self, stream: &mut Stream, out: &mut [f32]) {
+    fn draw(self, stream: &mut PhiloxStream, out: &mut [f32]) {
         for value in out {
             let u = stream.uniform(-1.0, 1.0) as f32;
             *value = match self {
@@ -88,7 +88,7 @@ fn saved(walker: &Walker) -> Vec<f64> {
     state
 }
 
-fn rollout(walker: &mut Walker, actions: &mut Stream, n_steps: usize) -> Vec<Seen> {
+fn rollout(walker: &mut Walker, actions: &mut PhiloxStream, n_steps: usize) -> Vec<Seen> {
     let mut action = vec![0.0; n_actions(walker)];
     let mut terms = [0.0; 5];
     (0..n_steps)
@@ -114,7 +114,7 @@ fn masses_are_those_of_the_geoms() {
         let mut applied = [0.0; 4];
         walker.applied(&mut applied);
         let model = model(walker);
-        assert_eq!(applied[0], model.body_mass()[model.id(Kind::Body, "torso").unwrap()]);
+        assert_eq!(applied[0], model.body_mass()[model.id(ElementKind::Body, "torso").unwrap()]);
         applied[0]
     };
     close(torso_mass(&hopper().unwrap()), 3.665);
@@ -243,7 +243,7 @@ fn place(simulation: &Simulation) -> f64 {
 /// Returns for each geom 1 if it touches anything, otherwise 0.
 fn touching(simulation: &Simulation, geoms: &[&str]) -> Vec<f32> {
     let touches = |name: &&str| {
-        let geom = simulation.model().id(Kind::Geom, name).unwrap();
+        let geom = simulation.model().id(ElementKind::Geom, name).unwrap();
         simulation.contacts().any(|(a, b)| a == geom || b == geom)
     };
     geoms.iter().map(|name| f32::from(u8::from(touches(name)))).collect()
@@ -262,7 +262,7 @@ struct Defined {
 
 impl Defined {
     fn of(before: &Simulation, after: &Simulation, initial_height: f64, action: &[f32]) -> Self {
-        let torso = after.model().id(Kind::Body, "torso").unwrap();
+        let torso = after.model().id(ElementKind::Body, "torso").unwrap();
         let (height, pitch) = (after.xipos(torso)[2], (-after.xmat(torso)[6]).asin());
         let mut observation = vec![height - initial_height, 0.0, 1.0];
         observation.extend(after.body_velocity(torso)[3..].iter().map(|v| 0.3 * v));
@@ -299,7 +299,7 @@ fn observation_and_reward_follow_from_the_state(
     (start[1], start[2]) = (0.3, 0.9);
     walker.reset_to(&start);
     let mut before = recomputed(&walker, &saved(&walker));
-    let initial_height = before.xipos(before.model().id(Kind::Body, "torso").unwrap())[2];
+    let initial_height = before.xipos(before.model().id(ElementKind::Body, "torso").unwrap())[2];
     let mut previous_flags = vec![0.0; flags.len()];
     let (mut draws, mut action, mut terms) = (stream(1), vec![0.0; n_actions(&walker)], [0.0; 5]);
     let (mut touched, mut fell) = (false, false);

@@ -4,8 +4,8 @@
 use crate::common::{self, action_bytes, floats, observe, step};
 use bytes::Bytes;
 use perturb::{
-    env::{Distribution, EnvironmentSpec, EpisodeEnd, EpisodeStart, Episodes, Settings, Version},
-    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroup, StepResult},
+    env::{Distribution, EnvironmentSpec, EpisodeSettings, Episodes, FinishedEpisode, StartedEpisode, Version},
+    pool::{Autoreset, Batch, BatchSettings, Error, Pool, ResetEntry, SlotGroupSettings, StepResult},
 };
 use rstest::rstest;
 use std::{
@@ -20,7 +20,7 @@ const MODES: [Autoreset; 3] = [Autoreset::NextStep, Autoreset::SameStep, Autores
 
 fn batch_settings(spec: &'static EnvironmentSpec, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, 17, 100, 2);
-    let groups = vec![SlotGroup { size, episodes }];
+    let groups = vec![SlotGroupSettings { size, episodes }];
     BatchSettings {
         spec,
         groups,
@@ -46,7 +46,7 @@ fn entry(slot: usize) -> ResetEntry {
 }
 
 /// Returns the starts of single environments as a batch reports them.
-fn starts(models: &[Episodes]) -> Vec<(u32, EpisodeStart)> {
+fn starts(models: &[Episodes]) -> Vec<(u32, StartedEpisode)> {
     models.iter().enumerate().map(|(slot, e)| (slot as u32, e.started(true))).collect()
 }
 
@@ -66,7 +66,7 @@ impl Model {
     fn new(settings: &BatchSettings) -> Self {
         let model = |slot| {
             let environment_index = settings.groups[0].episodes.environment_index + slot as u32;
-            let settings_of_slot = Settings { environment_index, ..settings.groups[0].episodes.clone() };
+            let settings_of_slot = EpisodeSettings { environment_index, ..settings.groups[0].episodes.clone() };
             Episodes::new((settings.spec.make)().unwrap(), settings_of_slot)
         };
         Self { models: (0..settings.size()).map(model).collect(), autoreset: settings.autoreset }
@@ -280,8 +280,8 @@ struct Seen {
     reward: Vec<u8>,
     flags: [u8; 2],
     terms: Vec<u8>,
-    end: Option<(Vec<u8>, EpisodeEnd)>,
-    start: Option<EpisodeStart>,
+    end: Option<(Vec<u8>, FinishedEpisode)>,
+    start: Option<StartedEpisode>,
 }
 
 /// Splits a batch's result into the results of its environments.
@@ -573,7 +573,7 @@ async fn open_four(pool: &Pool, name: &str) -> Batch {
     Batch::open(pool, settings).await.unwrap().0
 }
 
-fn ids(started: &[(u32, EpisodeStart)]) -> Vec<(u32, u64, u64, u32)> {
+fn ids(started: &[(u32, StartedEpisode)]) -> Vec<(u32, u64, u64, u32)> {
     started.iter().map(|(slot, s)| (*slot, s.id.trial_index, s.id.episode_index, s.id.episode_in_trial)).collect()
 }
 
@@ -591,7 +591,7 @@ async fn reset_touches_only_the_selected_slots() {
         // A trial has two episodes: the parameters stay for the second episode and change for the third.
         assert_eq!(ids(&started), [(1, 0, 1, 1), (3, 0, 1, 1)]);
         let opened = |slot: u32| {
-            let settings = Settings {
+            let settings = EpisodeSettings {
                 environment_index: 100 + slot,
                 ..batch_settings(spec, 4, Autoreset::SameStep).groups[0].episodes.clone()
             };
@@ -633,7 +633,7 @@ async fn seeds_restart_the_counts_and_keep_the_index() {
         assert_eq!(ids(&started), [(0, 0, 0, 0), (2, 0, 0, 0)]);
         for (k, (slot, seed)) in [(0, u64::MAX), (2, 5)].into_iter().enumerate() {
             let settings = batch_settings(spec, 4, Autoreset::SameStep).groups[0].episodes.clone();
-            let settings = Settings { seed, environment_index: 100 + slot, ..settings };
+            let settings = EpisodeSettings { seed, environment_index: 100 + slot, ..settings };
             let fresh = Episodes::new((spec.make)().unwrap(), settings);
             assert_eq!(started[k].1, fresh.started(true));
             let width = spec.observation.len();

@@ -5,7 +5,7 @@ use crate::common::{self, action_bytes, episodes, observe, play, start_line, ste
 use bytes::Bytes;
 use perturb::{
     env::{Distribution, EnvironmentSpec, Episodes, Error, Interval, Version},
-    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroup, StepResult},
+    pool::{self, Autoreset, Batch, BatchSettings, Pool, ResetEntry, SlotGroupSettings, StepResult},
 };
 use proptest::prelude::*;
 use serde::{Deserialize, Serialize};
@@ -407,7 +407,7 @@ proptest! {
 
 fn batch_settings(spec: &'static EnvironmentSpec, seed: u64, size: usize, autoreset: Autoreset) -> BatchSettings {
     let episodes = common::settings(spec, Version::R, seed, 0, 2);
-    let groups = vec![SlotGroup { size, episodes }];
+    let groups = vec![SlotGroupSettings { size, episodes }];
     BatchSettings {
         spec,
         groups,

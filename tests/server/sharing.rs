@@ -1,7 +1,7 @@
 //! Robots share one simulation for each thread. The sharing must not change any result.
 
 use perturb::{
-    env::{Action, ActionSpace, Environment, Purpose, Stream},
+    env::{Action, ActionSpec, DrawPurpose, Environment, PhiloxStream},
     tasks::{half_cheetah::half_cheetah, hopper::hopper, locomotion::Walker},
 };
 use perturb_mujoco::Simulation;
@@ -13,15 +13,15 @@ const ROBOTS: [Make; 2] = [|| hopper().unwrap(), || half_cheetah().unwrap()];
 
 fn n_actions(walker: &Walker) -> usize {
     match walker.spec().action {
-        ActionSpace::Continuous(channels) => channels.len(),
-        ActionSpace::Discrete(_) => panic!("walkers have motors"),
+        ActionSpec::Continuous(channels) => channels.len(),
+        ActionSpec::Discrete(_) => panic!("walkers have motors"),
     }
 }
 
 /// A robot with a random history, which is a function of a number.
 struct Life {
     walker: Walker,
-    stream: Stream,
+    stream: PhiloxStream,
     /// All outputs of the robot so far, as bits.
     seen: Vec<u64>,
     diverged: usize,
@@ -29,7 +29,7 @@ struct Life {
 
 impl Life {
     fn new(make: Make, number: u64) -> Self {
-        let stream = Stream::new(1, number, Purpose::Parameters, 0);
+        let stream = PhiloxStream::new(1, number, DrawPurpose::Parameters, 0);
         Self { walker: make(), stream, seen: Vec::new(), diverged: 0 }
     }
 
@@ -99,7 +99,7 @@ fn robots_that_take_turns_live_as_each_does_alone(
         thread::spawn(live).join().unwrap()
     };
     let mut lives: Vec<Life> = (0..LIVES).map(|number| Life::new(make, number)).collect();
-    let mut order = Stream::new(2, 0, Purpose::InitialState, threads as u64);
+    let mut order = PhiloxStream::new(2, 0, DrawPurpose::InitialState, threads as u64);
     let mut turns = [0; LIVES as usize];
     while turns.iter().any(|&turns| turns < TURNS) {
         // Some robots continue now, and each thread gets some of them. A robot moves between threads.
@@ -131,7 +131,7 @@ fn physics_is_mujocos_with_a_model_and_data_of_ones_own(#[values(ROBOTS[0], ROBO
     for friction in [0.2, 0.8, 1.4] {
         let mut walker = make();
         walker.set_parameters(&[1.0, 700.0, friction]);
-        walker.reset(&mut Stream::new(3, 0, Purpose::InitialState, 0));
+        walker.reset(&mut PhiloxStream::new(3, 0, DrawPurpose::InitialState, 0));
         let mut own = walker
             .inspect(|simulation| {
                 let mut own = Simulation::new(simulation.model().try_clone().unwrap()).unwrap();
@@ -140,7 +140,7 @@ fn physics_is_mujocos_with_a_model_and_data_of_ones_own(#[values(ROBOTS[0], ROBO
             })
             .unwrap();
         own.step1().unwrap();
-        let mut draws = Stream::new(3, 0, Purpose::InitialState, 1);
+        let mut draws = PhiloxStream::new(3, 0, DrawPurpose::InitialState, 1);
         let mut action = vec![0.0; n_actions(&walker)];
         let (mut state, mut touched) = (vec![0.0; own.model().n_state()], 0);
         for _ in 0..300 {

@@ -2,7 +2,7 @@
 
 use crate::common;
 use perturb::{
-    env::{Environment, Purpose, Stream, Version},
+    env::{DrawPurpose, Environment, PhiloxStream, Version},
     tasks,
 };
 use rstest::rstest;
@@ -16,11 +16,11 @@ fn hex(value: &Value) -> u64 {
     u64::from_str_radix(value.as_str().unwrap(), 16).unwrap()
 }
 
-fn rows() -> impl Iterator<Item = (Stream, Value)> {
+fn rows() -> impl Iterator<Item = (PhiloxStream, Value)> {
     FIXTURE.lines().map(|line| {
         let row: Value = serde_json::from_str(line).unwrap();
-        let purpose = [Purpose::Parameters, Purpose::InitialState][row["purpose"].as_u64().unwrap() as usize];
-        (Stream::new(hex(&row["seed"]), hex(&row["environment"]), purpose, hex(&row["index"])), row)
+        let purpose = [DrawPurpose::Parameters, DrawPurpose::InitialState][row["purpose"].as_u64().unwrap() as usize];
+        (PhiloxStream::new(hex(&row["seed"]), hex(&row["environment"]), purpose, hex(&row["index"])), row)
     })
 }
 
@@ -63,7 +63,7 @@ fn parameters_are_the_trials_numbers_in_the_catalogues_order() {
         let mut e = common::episodes(spec, Version::R, 12, 34, 2);
         for trial in 0..3 {
             for _ in 0..2 {
-                let mut stream = Stream::new(12, 34, Purpose::Parameters, trial);
+                let mut stream = PhiloxStream::new(12, 34, DrawPurpose::Parameters, trial);
                 let expected: Vec<f64> = spec
                     .parameters
                     .iter()
@@ -91,7 +91,7 @@ fn initial_states_are_the_episodes_numbers_in_the_states_order(
     #[case] ranges: &[(f64, f64)],
     #[values(0, 1, 7)] episode: u64,
 ) {
-    let mut stream = Stream::new(12, 34, Purpose::InitialState, episode);
+    let mut stream = PhiloxStream::new(12, 34, DrawPurpose::InitialState, episode);
     let mut environment: Box<dyn Environment> = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
     environment.reset(&mut stream.clone());
     let mut state = Vec::new();

@@ -3,8 +3,9 @@
 use crate::common::{episodes, observe, settings, step};
 use perturb::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, EpisodeEnd, Episodes,
-        Error, Outcome, Purpose, RewardTerm, Stream, Success, Transition, Version,
+        Achievement, Action, ActionSpec, ChannelSpec, DrawPurpose, Environment, EnvironmentSpec, Episodes, Error,
+        FinishedEpisode, Outcome, PhiloxStream, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
+        Version,
     },
     scene::Scene,
     tasks,
@@ -12,9 +13,9 @@ use perturb::{
 use rstest::rstest;
 
 const LIMIT: u32 = 8;
-const TIME: &[Channel] = &[Channel::unbounded("time", "1")];
+const TIME: &[ChannelSpec] = &[ChannelSpec::unbounded("time", "1")];
 
-const fn scripted_spec(achievement: Achievement, comparison: Comparison, threshold: f64) -> EnvironmentSpec {
+const fn scripted_spec(achievement: Achievement, comparison: SuccessComparison, threshold: f64) -> EnvironmentSpec {
     EnvironmentSpec {
         name: "Scripted",
         revision: 0,
@@ -22,24 +23,24 @@ const fn scripted_spec(achievement: Achievement, comparison: Comparison, thresho
         make: &|| unreachable!("it is given its script"),
         parameters: &[],
         observation: TIME,
-        action: ActionSpace::Discrete(&["nothing", "something"]),
+        action: ActionSpec::Discrete(&["nothing", "something"]),
         state: TIME,
-        reward_terms: &[RewardTerm { name: "none", description: "0" }],
+        reward_terms: &[RewardTermSpec { name: "none", description: "0" }],
         applied: &[],
         step_limit: LIMIT,
         control_timestep: 1.0,
         step_cost: 0.1,
-        success: Success { description: "", achievement, comparison, threshold },
+        success: SuccessRuleSpec { description: "", achievement, comparison, threshold },
         push: None,
         code_success: None,
         heatmap_axes: None,
     }
 }
 
-static LASTED_5: EnvironmentSpec = scripted_spec(Achievement::Length, Comparison::AtLeast, 5.0);
-static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(Achievement::FirstGoal, Comparison::AtMost, 5.0);
-static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(Achievement::LastGoals, Comparison::AtLeast, 3.0);
-static HELD_FOR_ANY_3: EnvironmentSpec = scripted_spec(Achievement::LongestGoals, Comparison::AtLeast, 3.0);
+static LASTED_5: EnvironmentSpec = scripted_spec(Achievement::Length, SuccessComparison::AtLeast, 5.0);
+static REACHED_WITHIN_5: EnvironmentSpec = scripted_spec(Achievement::FirstGoal, SuccessComparison::AtMost, 5.0);
+static HELD_FOR_LAST_3: EnvironmentSpec = scripted_spec(Achievement::LastGoals, SuccessComparison::AtLeast, 3.0);
+static HELD_FOR_ANY_3: EnvironmentSpec = scripted_spec(Achievement::LongestGoals, SuccessComparison::AtLeast, 3.0);
 
 /// An environment that follows a script of one character a step: `.` nothing, `g` the goal holds, `T` terminated, `G`
 /// both, `D` diverged.
@@ -58,7 +59,7 @@ impl Environment for Scripted {
 
     fn applied(&self, _: &mut [f64]) {}
 
-    fn reset(&mut self, _: &mut Stream) {
+    fn reset(&mut self, _: &mut PhiloxStream) {
         self.time = 0;
     }
 
@@ -89,7 +90,7 @@ impl Environment for Scripted {
 }
 
 /// Plays a script, whose last character must end the episode. Returns the last outcome, and the ended episode.
-fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, EpisodeEnd) {
+fn run(spec: &'static EnvironmentSpec, script: &'static str) -> (Outcome, FinishedEpisode) {
     let scripted = Scripted { spec, script: script.as_bytes(), time: 0 };
     let mut e = Episodes::new(Box::new(scripted), settings(spec, Version::D, 0, 0, 1));
     for t in 1..=script.len() {
@@ -208,7 +209,7 @@ fn counts_start_anew_with_every_episode() {
 
 /// Plays an environment with discrete actions from this state to the end of the episode. `policy` chooses actions from
 /// time and observation.
-fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, EpisodeEnd) {
+fn drive(name: &str, state: &[f64], policy: impl Fn(u32, &[f32]) -> i32) -> (Outcome, FinishedEpisode) {
     let mut e = episodes(tasks::catalogue().find(name).unwrap(), Version::D, 0, 0, 1);
     e.begin(Some(state));
     for t in 0.. {
@@ -233,11 +234,11 @@ fn the_papers_code_has_thresholds_of_its_own(#[case] name: &str, #[case] descrip
 }
 
 /// Returns whether an episode is a success by the rule of the paper's code.
-fn by_code(name: &str, end: &EpisodeEnd) -> bool {
+fn by_code(name: &str, end: &FinishedEpisode) -> bool {
     let code = tasks::catalogue().find(name).unwrap().code_success.expect("a rule of its own");
     end.code_achieved.is_some_and(|achieved| match code.comparison {
-        Comparison::AtLeast => achieved >= code.threshold,
-        Comparison::AtMost => achieved <= code.threshold,
+        SuccessComparison::AtLeast => achieved >= code.threshold,
+        SuccessComparison::AtMost => achieved <= code.threshold,
     })
 }
 
@@ -260,7 +261,7 @@ fn cart_pole_succeeds_from_195_steps() {
 }
 
 /// Plays MountainCar: waits at the bottom of the valley, then builds up energy by pushing in the direction of motion.
-fn mountain_car(wait: u32, position: f64) -> (Outcome, EpisodeEnd) {
+fn mountain_car(wait: u32, position: f64) -> (Outcome, FinishedEpisode) {
     drive("MountainCar", &[position, 0.0], |t, o| if t < wait { 1 } else { if o[1] < 0.0 { 0 } else { 2 } })
 }
 
@@ -313,7 +314,7 @@ fn acrobot_succeeds_up_to_80_steps() {
 
 /// Plays an episode of a pendulum that is held at an angle in each step. Returns whether the pendulum was near upright
 /// after each step, and the ended episode.
-fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, EpisodeEnd) {
+fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, FinishedEpisode) {
     let spec = tasks::catalogue().find("Pendulum").unwrap();
     // The rod is light enough for the torque to hold it at any angle.
     let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
@@ -372,15 +373,15 @@ fn check_goal(
     margin: impl Fn(&[f64]) -> f64,
 ) {
     let mut environment = tasks::catalogue().find(name).and_then(|spec| (spec.make)()).unwrap();
-    let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
+    let mut stream = PhiloxStream::new(1, 0, DrawPurpose::InitialState, 0);
     let mut terms = vec![0.0; environment.spec().reward_terms.len()];
     let mut near = [0, 0];
     for _ in 0..100_000 {
         let state: Vec<f64> = low.iter().zip(high).map(|(low, high)| stream.uniform(*low, *high)).collect();
         environment.reset_to(&state);
         let action = match environment.spec().action {
-            ActionSpace::Discrete(_) => Action::Discrete(1),
-            ActionSpace::Continuous(_) => Action::Continuous(&[0.0]),
+            ActionSpec::Discrete(_) => Action::Discrete(1),
+            ActionSpec::Continuous(_) => Action::Continuous(&[0.0]),
         };
         let transition = environment.step(action, &mut terms);
         let mut state = Vec::new();

@@ -9,7 +9,7 @@ use std::process::ExitCode;
 
 use serde_json::{Value, json};
 
-use perturb_experiment::{Folder, Plan};
+use perturb_experiment::{ExperimentFolder, Plan};
 use perturb_files as files;
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
@@ -119,7 +119,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
 /// Returns the options of the servers. If the records belong to an experiment, adds the task folders of its plan.
 fn server_args(args: &AuditArgs) -> Result<ServerArgs> {
     let path = std::path::absolute(&args.dir).map_err(system("find the absolute path of the records"))?;
-    let mut folders = path.ancestors().take(MAX_DEPTH).map(|path| Folder::new(path).plan_path());
+    let mut folders = path.ancestors().take(MAX_DEPTH).map(|path| ExperimentFolder::new(path).plan_path());
     match folders.find(|plan| plan.is_file()) {
         Some(plan) => with_tasks_of(&args.server, &Plan::load(&plan)?),
         None => Ok(args.server.clone()),
@@ -199,7 +199,7 @@ fn recorded_policies(args: &AuditArgs) -> Result<Vec<RecordedPolicy>> {
         let message = format!("{} is a file of records: give the tested policy with --checkpoint", path.display());
         return Err(CommandError::Usage(message));
     }
-    let folder = Folder::new(path);
+    let folder = ExperimentFolder::new(path);
     let plan = plan_in(&folder)?;
     let finished = plan.cells.iter().map(|cell| folder.cell(&cell.id)).filter(|cell| cell.is_settled(false));
     let paths = finished.map(|cell| cell.path().to_owned()).filter(|path| path.join(FILE).is_file());

@@ -5,7 +5,7 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use perturb_experiment::scheduler::{Backend, ProgressEvent, Rate, RunEnd, RunError, run as run_plan, write_line};
-use perturb_experiment::{CellState, CellStates, DoneCells, FailureId, Folder, LayeredStates, Plan};
+use perturb_experiment::{CellState, CellStates, DoneCells, ExperimentFolder, FailureId, LayeredStates, Plan};
 use perturb_files::interrupt::StopFlag;
 use perturb_report::ReportInputs;
 use perturb_text::{count, quoted};
@@ -23,7 +23,7 @@ const MAX_RATES: usize = 24;
 /// Runs a plan's cells in a first round, and the cells that its tuning selects in a second round.
 pub(super) struct PlanRunner<'a> {
     args: &'a RunArgs,
-    folder: &'a Folder,
+    folder: &'a ExperimentFolder,
     /// Finished cells in the table of --done.
     done: Option<&'a DoneCells<'a>>,
     stop: &'a StopFlag,
@@ -44,7 +44,7 @@ impl<'a> PlanRunner<'a> {
     pub(super) fn begin(
         args: &'a RunArgs,
         plan: Plan,
-        folder: &'a Folder,
+        folder: &'a ExperimentFolder,
         done: Option<&'a DoneCells<'a>>,
         stop: &'a StopFlag,
     ) -> Result<Self> {
@@ -147,7 +147,7 @@ impl<'a> PlanRunner<'a> {
 }
 
 /// Returns the states of cells. A cell's state is read from `folder`, or from `done` if the cell is not in `folder`.
-pub(super) fn layered<'a>(folder: &'a Folder, done: Option<&'a DoneCells<'a>>) -> LayeredStates<'a> {
+pub(super) fn layered<'a>(folder: &'a ExperimentFolder, done: Option<&'a DoneCells<'a>>) -> LayeredStates<'a> {
     LayeredStates { first: folder, then: done.map(|done| done as &dyn CellStates) }
 }
 
@@ -166,7 +166,7 @@ pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Resu
 
 /// Copies the plan into its folder, and prints a note if it replaces another plan. With --cell an existing plan is not
 /// replaced: the command may be a queued job, whose plan is older than the plan in the folder.
-fn keep_plan(args: &RunArgs, plan: &Plan, folder: &Folder) -> Result<()> {
+fn keep_plan(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> Result<()> {
     let path = folder.plan_path();
     if !args.cell.is_empty() && path.exists() {
         return Ok(());

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::Path;
 
-use perturb_experiment::{Folder, export};
+use perturb_experiment::{ExperimentFolder, export};
 use perturb_files::{require_writable, write_atomically};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_records::{MergeCounts, Records, ResultsTable, StudyEpisodes};
@@ -73,7 +73,7 @@ fn study(args: &ExportArgs, dir: &Path) -> Result<String> {
 
 /// Adds the results of the cells in `dir` to the table. With --policies it also stores their policies and episodes.
 fn add(args: &ExportArgs, table: &mut ResultsTable, study: &str, dir: &Path) -> Result<MergeCounts> {
-    let folder = Folder::new(dir);
+    let folder = ExperimentFolder::new(dir);
     let plan = plan_in(&folder)?;
     let beside = args.into.parent().unwrap_or(Path::new(""));
     let path = StudyEpisodes::path(beside, study);

@@ -39,7 +39,7 @@ use std::process::ExitCode;
 use args::{Cli, CliCommand, PlayArgs, ServerArgs, WaitArgs};
 use display::{AboveBar, note};
 use error::{CommandError, Result};
-use perturb_experiment::{Folder, Plan};
+use perturb_experiment::{ExperimentFolder, Plan};
 use perturb_files::interrupt::{StopFlag, end_on_signals};
 use perturb_learner::client::{ActorLocation, Address, PrivateServer, ServerWait, Servers};
 use tracing::Level;
@@ -175,12 +175,12 @@ fn playing_servers(args: &PlayArgs, stop: &StopFlag) -> Result<Servers> {
 }
 
 /// Loads the plan in an experiment's folder, and adds the cells that its tuning has selected so far.
-fn plan_in(folder: &Folder) -> Result<Plan> {
+fn plan_in(folder: &ExperimentFolder) -> Result<Plan> {
     Ok(Plan::load(&folder.require_plan()?)?.with_selected_cells(folder)?)
 }
 
 /// Refuses servers whose models differ from those of the results in `folder`.
-fn check_models(servers: &Servers, plan: &Plan, folder: &Folder) -> Result<()> {
+fn check_models(servers: &Servers, plan: &Plan, folder: &ExperimentFolder) -> Result<()> {
     plan.environments().into_iter().try_for_each(|name| Ok(folder.check_model(plan, &servers.environment(name)?)?))
 }
 

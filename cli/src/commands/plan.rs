@@ -5,8 +5,8 @@ use std::io::Write;
 use std::time::Duration;
 
 use perturb_experiment::{
-    Cell, CellDurations, CellStates, Estimate, Folder, Grouping, Measurement, Plan, Selection, benchmark_cells,
-    estimates,
+    Cell, CellDurations, CellStates, Estimate, ExperimentFolder, Grouping, Measurement, Plan, Selection,
+    benchmark_cells, estimates,
 };
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::Servers;
@@ -31,7 +31,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
     }
     args.json.check()?;
     // List cells: all with --cells, or the unfinished ones with --unfinished-in.
-    let folder = args.unfinished_in.as_deref().map(Folder::new);
+    let folder = args.unfinished_in.as_deref().map(ExperimentFolder::new);
     let known = folder.as_ref().map_or_else(|| Ok(plan.clone()), |folder| plan.with_selected_cells(folder))?;
     let listed: Vec<&Cell> = match &folder {
         Some(folder) => known.cells.iter().filter(|cell| !folder.cell(&cell.id).is_settled(true)).collect(),
@@ -49,7 +49,7 @@ pub(super) fn run(args: &PlanArgs) -> Result<()> {
         return Ok(());
     }
     // Divide the cells into groups as `perturb run` would. Cells that tuning will select are included.
-    let timings_from = args.timings_from.as_deref().map(Folder::new);
+    let timings_from = args.timings_from.as_deref().map(ExperimentFolder::new);
     timings_from.iter().try_for_each(|folder| folder.require_plan().map(drop))?;
     let known = plan.with_expected_cells(timings_from.as_ref().map(|folder| folder as &dyn CellStates))?;
     let grouping = Grouping { max_cells: args.group, at_a_time: args.jobs.unwrap_or_else(cores) };
@@ -103,7 +103,7 @@ fn estimate(
     args: &PlanArgs,
     plan: &Plan,
     grouping: Grouping,
-    finished: Option<&(Folder, CellDurations<'_>)>,
+    finished: Option<&(ExperimentFolder, CellDurations<'_>)>,
     (servers, limits): (&Servers, &HashMap<&str, u32>),
     stop: &StopFlag,
 ) -> Result<()> {

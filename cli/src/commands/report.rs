@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use perturb_experiment::{BudgetAxis, Folder, Results, read_curves};
+use perturb_experiment::{BudgetAxis, ExperimentFolder, Results, read_curves};
 use perturb_files::{require_writable, write_atomically};
 use perturb_report::curves_table;
 use perturb_report::plot::{CurveQuantity, draw_curves, save};
@@ -72,7 +72,7 @@ fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
 }
 
 pub(super) fn curves(args: &CurvesArgs) -> Result<()> {
-    let folder = Folder::new(&args.dir);
+    let folder = ExperimentFolder::new(&args.dir);
     let plan = plan_in(&folder)?;
     let out = args.out.clone().unwrap_or_else(|| args.dir.join("report"));
     refuse_file(&out)?;

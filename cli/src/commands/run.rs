@@ -10,7 +10,9 @@ use std::time::Duration;
 
 use perturb_experiment::runs::RunKind;
 use perturb_experiment::scheduler::{BackendEvent, CellEvent, EventLineWriter, JobCell, Local, WorkerJob};
-use perturb_experiment::{Cell, CellDurations, DoneCells, Folder, Grouping, Plan, benchmark_cells, estimates};
+use perturb_experiment::{
+    Cell, CellDurations, DoneCells, ExperimentFolder, Grouping, Plan, benchmark_cells, estimates,
+};
 use perturb_files::interrupt::StopFlag;
 use perturb_files::require_writable;
 use perturb_learner::cell::{CellJob, run_cells};
@@ -30,7 +32,7 @@ use super::{check_models, cores, load_plan, recurrent, refuse_file, servers_of_j
 const MEASURE_TIME: Duration = Duration::from_secs(1);
 
 pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
-    let folder = Folder::new(&args.out);
+    let folder = ExperimentFolder::new(&args.out);
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     if args.worker {
         return run_worker(args, &folder, &stop);
@@ -76,7 +78,7 @@ fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell>
 
 /// Runs this process as a worker: reads a job from a line of standard input, runs its cells, and writes their events to
 /// standard output.
-fn run_worker(args: &RunArgs, folder: &Folder, stop: &StopFlag) -> Result<ExitCode> {
+fn run_worker(args: &RunArgs, folder: &ExperimentFolder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
     let order: WorkerJob = serde_json::from_str(&text)
@@ -135,7 +137,7 @@ fn stop_at_end_of_input(stop: &StopFlag) -> Result<()> {
 fn all_cells(
     args: &RunArgs,
     plan: Plan,
-    folder: &Folder,
+    folder: &ExperimentFolder,
     done: Option<&DoneCells<'_>>,
     stop: &StopFlag,
 ) -> Result<ExitCode> {
@@ -180,7 +182,7 @@ fn all_cells(
 }
 
 /// Returns the indices of the cells that are not finished. Failed cells count as finished without --retry-failed.
-fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &Folder) -> Vec<usize> {
+fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> Vec<usize> {
     let is_settled = |&cell: &usize| folder.cell(&plan.cells[cell].id).is_settled(!args.retry_failed);
     (0..plan.cells.len()).filter(|cell| !is_settled(cell)).collect()
 }
@@ -193,7 +195,7 @@ fn upper_bounds(
     args: &RunArgs,
     servers: &Servers,
     plan: &Plan,
-    folder: &Folder,
+    folder: &ExperimentFolder,
     grouping: Grouping,
     stop: &StopFlag,
 ) -> Result<Vec<Option<f64>>> {
@@ -229,7 +231,7 @@ fn upper_bounds(
 }
 
 /// Returns the command of a worker process.
-fn worker_command(args: &RunArgs, folder: &Folder, servers: &str) -> Command {
+fn worker_command(args: &RunArgs, folder: &ExperimentFolder, servers: &str) -> Command {
     // This path starts the program of this process, even if its file has been replaced since.
     let mut command = Command::new("/proc/self/exe");
     // Workers read the copy of the plan, because users may edit the original file. With --cell they read the original,

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use perturb_experiment::scheduler::slurm::{JobCommand, Jobs, Slurm, SlurmOptions};
-use perturb_experiment::{DoneCells, Estimate, Folder, Grouping, Plan, benchmark_cells, estimates};
+use perturb_experiment::{DoneCells, Estimate, ExperimentFolder, Grouping, Plan, benchmark_cells, estimates};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::client::{Address, Servers};
 use perturb_learner::measure::measure;
@@ -27,7 +27,7 @@ pub(super) fn run(args: &RunArgs, plan: Plan, done: Option<&DoneCells<'_>>, stop
     // This process measures the durations of cells, so it needs libtorch for recurrent policies.
     recurrent::prepare_for(&plan)?;
     let path = std::path::absolute(&args.out).map_err(system("find the absolute path of --out"))?;
-    let folder = Folder::new(&path);
+    let folder = ExperimentFolder::new(&path);
     check_server_args(&args.server)?;
     // Task folders are needed even with --server, because a private server checks the plan on this machine.
     let ServerArgs { task, .. } = with_tasks_of(&ServerArgs { server: Vec::new(), ..args.server.clone() }, &plan)?;

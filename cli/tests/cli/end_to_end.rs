@@ -6,11 +6,11 @@ use std::time::{Duration, Instant};
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers, Session, StepReply};
+use perturb_learner::client::{Address, ClientSession, OpenOptions, PrivateServer, Servers, StepReply};
 use perturb_learner::evaluation::test;
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Collector, Normalisers, Rollout};
-use perturb_policy::{ActionKind, CollectUntil, Inputs, Player, PolicySpec, Role};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{Collector, Normalisers, RolloutBuffer};
+use perturb_policy::{ActionKind, CollectUntil, Inputs, Player, PlayerRole, PolicySpec};
 use perturb_protocol::Version;
 use perturb_torch::{Sequences, TorchPolicy};
 
@@ -131,19 +131,19 @@ fn pendulums() -> OpenOptions {
 
 /// Collects two rollouts of 150 steps. An episode of Pendulum has 200 steps, so the second rollout begins in the middle
 /// of an episode and contains the end of it.
-fn two_rollouts(servers: &Servers) -> (Policy, [Rollout; 2]) {
+fn two_rollouts(servers: &Servers) -> (TrainablePolicy, [RolloutBuffer; 2]) {
     let mut observations = Vec::new();
-    let mut session = Session::open(servers, &pendulums(), &mut observations).expect("a session");
+    let mut session = ClientSession::open(servers, &pendulums(), &mut observations).expect("a session");
     let size = session.observation_size();
     let action = ActionKind::Continuous { size: 1 };
     let spec = PolicySpec { observation_size: size, action, hidden: vec![16], lstm: Some(8) };
-    let policy = Policy::new(spec.clone(), 1).expect("a policy");
+    let policy = TrainablePolicy::new(spec.clone(), 1).expect("a policy");
     let inputs = Inputs::new(size, action, N_ENVS, false);
-    let mut player = Player::new(&spec, inputs, N_ENVS, 1, Normalisers::default(), Role::training(1));
+    let mut player = Player::new(&spec, inputs, N_ENVS, 1, Normalisers::default(), PlayerRole::training(1));
     player.begin(&observations, None).expect("observations");
     let mut collector = Collector::new(player);
     let rollouts = [(); 2].map(|()| {
-        let mut rollout = Rollout::new(N_STEPS, N_ENVS, size, 1);
+        let mut rollout = RolloutBuffer::new(N_STEPS, N_ENVS, size, 1);
         let steps = CollectUntil::Steps(N_STEPS);
         collector.collect(&mut session, policy.flat_weights(), steps, &mut rollout, |_| {}).expect("a rollout");
         rollout
@@ -185,7 +185,7 @@ fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
         assert!(close(rollout.values(), &expected));
     }
 
-    let mut replayed = Session::open(&servers, &pendulums(), &mut Vec::new()).expect("a session");
+    let mut replayed = ClientSession::open(&servers, &pendulums(), &mut Vec::new()).expect("a session");
     let mut reply = StepReply::default();
     let actions: Vec<f32> = rollouts.iter().flat_map(|rollout| rollout.actions().to_vec()).collect();
     for actions in actions.chunks(N_ENVS).take(200) {
@@ -211,7 +211,7 @@ fn every_test_episode_begins_without_memories() {
     let mut checkpoint = outcome.checkpoint;
     let action = checkpoint.policy.action;
     let spec = PolicySpec { observation_size: 4, action, hidden: vec![], lstm: Some(1) };
-    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    let mut weights = TrainablePolicy::new(spec.clone(), 1).expect("a policy").weights();
     for array in &mut weights {
         array.data = match array.name.as_str() {
             "lstm.bias" => vec![20.0, 20.0, 0.1, 20.0], // keeps all, adds tanh 0.1 a step, shows all
@@ -259,7 +259,7 @@ fn a_refused_request_keeps_the_session_open() {
         observe: Default::default(),
     };
     let mut observations = Vec::new();
-    let mut session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let mut session = ClientSession::open(&servers, &options, &mut observations).expect("a session");
     let mut reply = StepReply::default();
     let error = session.step(&[9, 0, 0, 0, 0, 0, 0, 0], &mut reply).expect_err("there is no action 9").to_string();
     assert!(error.contains("refused a step") && error.contains('9'), "{error}");
@@ -269,7 +269,7 @@ fn a_refused_request_keeps_the_session_open() {
     assert!(observations.iter().all(|x| x.abs() <= 0.05), "CartPole starts near 0");
 
     let wrong = OpenOptions { environment: "CartPool".into(), ..options };
-    let error = Session::open(&servers, &wrong, &mut observations).expect_err("no such environment").to_string();
+    let error = ClientSession::open(&servers, &wrong, &mut observations).expect_err("no such environment").to_string();
     assert!(error.contains("CartPool"), "{error}");
 }
 
@@ -418,7 +418,7 @@ fn a_server_keeps_a_learner_that_computes_for_long() {
         episodes_per_trial: 1,
         observe: Default::default(),
     };
-    let mut session = Session::open(&servers, &options, &mut Vec::new()).expect("a session");
+    let mut session = ClientSession::open(&servers, &options, &mut Vec::new()).expect("a session");
     let compute = || std::thread::sleep(Duration::from_secs(4));
     servers.keep_alive_during(compute);
     session.step(&[1, 0, 0, 0], &mut StepReply::default()).expect("the session lives");

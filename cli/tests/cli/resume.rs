@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::{Checkpoint, ResumeState};
-use perturb_learner::client::{ClientError, OpenOptions, Servers, Session, StepReply};
+use perturb_learner::client::{ClientError, ClientSession, OpenOptions, Servers, StepReply};
 use perturb_learner::evaluation::{TestOptions, Tester};
 use perturb_learner::training::{RunDirectory, TrainOutcome, resume, train};
 use perturb_protocol::Version;
@@ -162,7 +162,7 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
         };
         let open = |servers| {
             let mut observations = Vec::new();
-            (Session::open(servers, &options, &mut observations).expect("a session"), observations)
+            (ClientSession::open(servers, &options, &mut observations).expect("a session"), observations)
         };
         let actions = |step: usize| -> Vec<u8> {
             match width {
@@ -170,7 +170,7 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
                 _ => (0..n * width).flat_map(|i| ((step * 7 + i) as f32).sin().to_le_bytes()).collect(),
             }
         };
-        let steps = |session: &mut Session<'_>, range: std::ops::Range<usize>| {
+        let steps = |session: &mut ClientSession<'_>, range: std::ops::Range<usize>| {
             let step = |step| {
                 let mut reply = StepReply::default();
                 session.step(&actions(step), &mut reply).expect("a step");
@@ -196,7 +196,7 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
         }
         let wrong = OpenOptions { environment: "Pendulum".into(), ..options.clone() };
         let mut observations = Vec::new();
-        let mut other = Session::open(&two, &wrong, &mut observations).expect("a session");
+        let mut other = ClientSession::open(&two, &wrong, &mut observations).expect("a session");
         let error = other.restore(0..n, &snapshots).expect_err("of another environment").to_string();
         assert!(error.contains("refused to restore snapshots") && error.contains(environment), "{error}");
     }

@@ -5,9 +5,9 @@ use std::net::TcpListener;
 use std::path::{Path, PathBuf};
 use std::process::Child;
 
-use perturb_experiment::{Folder, Plan};
+use perturb_experiment::{ExperimentFolder, Plan};
 use perturb_files::interrupt::StopFlag;
-use perturb_learner::client::{Address, OpenOptions, Servers, Session};
+use perturb_learner::client::{Address, ClientSession, OpenOptions, Servers};
 use perturb_protocol::Version;
 
 use crate::common::{addresses, ended, kill, perturb, server, stderr, wait_for};
@@ -51,7 +51,7 @@ impl Runs {
 
     /// Returns the content of a file of every cell, by the cell's id; `None` if the file is missing.
     fn files(&self, name: &str, file: &str) -> BTreeMap<String, Option<String>> {
-        let folder = Folder::new(&self.out(name));
+        let folder = ExperimentFolder::new(&self.out(name));
         let read = |id: &str| std::fs::read_to_string(folder.cell(id).path().join(file)).ok();
         self.plan.cells.iter().map(|cell| (cell.id.clone(), read(&cell.id))).collect()
     }
@@ -101,7 +101,7 @@ fn shutting_down(with_session: impl FnOnce(&Address)) {
         .expect("perturb-server");
     wait_for("the server", || Servers::connect(std::slice::from_ref(&address)).is_ok());
     let servers = Servers::connect(std::slice::from_ref(&address)).expect("a connection");
-    let session = Session::open(&servers, &options(), &mut Vec::new()).expect("a session");
+    let session = ClientSession::open(&servers, &options(), &mut Vec::new()).expect("a session");
     kill("-TERM", server.id());
     wait_for("the beginning of the end", || Servers::connect(std::slice::from_ref(&address)).is_err());
     with_session(&address);
@@ -190,7 +190,7 @@ fn a_name_is_one_server_however_many_addresses_it_has() {
     for turn in 0..3 {
         let one =
             Servers::connect_to_one(std::slice::from_ref(&name), turn, &StopFlag::default()).expect("a connection");
-        Session::open(&one, &options(), &mut Vec::new()).expect("a session");
+        ClientSession::open(&one, &options(), &mut Vec::new()).expect("a session");
     }
     assert_eq!(Servers::connect(&[name.clone(), name]).expect("connections").addresses().len(), 2);
     drop(child.stdin.take());

@@ -6,11 +6,11 @@ use std::sync::OnceLock;
 use std::thread::{self, JoinHandle};
 
 use perturb::config::{Arguments, Config};
-use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, Stream, Transition};
+use perturb::env::{Action, Catalogue, Environment, EnvironmentSpec, Error, PhiloxStream, Transition};
 use perturb::scene::Scene;
 use perturb::server::{net::listener::Listener, security::Security};
 use perturb::tasks::cart_pole;
-use perturb_experiment::{CellResult, CellState, Folder, Plan};
+use perturb_experiment::{CellResult, CellState, ExperimentFolder, Plan};
 use perturb_records::{FILE, Records};
 use tempfile::TempDir;
 use tokio::sync::oneshot;
@@ -73,7 +73,7 @@ fn stdout(output: &Output) -> String {
 }
 
 fn results(directory: &Path) -> Vec<CellResult> {
-    let folder = Folder::new(&directory.join("out"));
+    let folder = ExperimentFolder::new(&directory.join("out"));
     let plan = Plan::load(&folder.plan_path()).expect("the folder's copy can be read, with the files that it names");
     let result = |cell| match folder.state(cell) {
         Ok(CellState::Done(result)) => *result,
@@ -142,7 +142,7 @@ fn parameters_are_those_of_the_sets(records: &Records) {
 fn a_different_replay_is_reported_as_failure() {
     let directory = experiment();
     stdout(&run(directory.path(), &["--cell", "0"]));
-    let folder = Folder::new(&directory.path().join("out"));
+    let folder = ExperimentFolder::new(&directory.path().join("out"));
     let plan = Plan::load(&folder.plan_path()).expect("a plan");
     let cell = folder.cell(&plan.cells[0].id).path().to_owned();
     let mut records = Records::read(&cell.join(FILE)).expect("recorded");
@@ -212,7 +212,7 @@ fn disturbed_episodes_are_recorded_and_replayed() {
             result.agreement.as_ref().unwrap().largest.as_ref().map(|difference| difference.relative),
             Some(0.0)
         );
-        let records = Records::read(&Folder::new(&out).cell(&result.id).path().join(FILE)).expect("recorded");
+        let records = Records::read(&ExperimentFolder::new(&out).cell(&result.id).path().join(FILE)).expect("recorded");
         let place = |name: &str| records.about.parameters.iter().position(|parameter| parameter.name == name).unwrap();
         let values = |set: &str, name: &str| {
             let place = place(name);
@@ -303,7 +303,7 @@ impl Environment for Stuck {
         self.0.applied(out);
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.0.reset(stream);
     }
 
@@ -397,7 +397,7 @@ fn an_edit_that_does_not_take_effect_stops_a_cell() {
     let server = InThread::start(Catalogue::default().with(Stuck::spec()).expect("a free name"));
     let output = run(directory.path(), &["--jobs", "1", "--server", &server.address]);
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
-    let folder = Folder::new(&directory.path().join("out"));
+    let folder = ExperimentFolder::new(&directory.path().join("out"));
     let plan = Plan::load(&folder.plan_path()).expect("a plan");
     for cell in &plan.cells {
         let Ok(CellState::Failed(failure)) = folder.state(cell) else { panic!("{} has not failed", cell.id) };

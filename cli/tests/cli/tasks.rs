@@ -4,7 +4,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use perturb_experiment::{CellState, Folder, Plan};
+use perturb_experiment::{CellState, ExperimentFolder, Plan};
 use perturb_learner::client::{Address, ClientError, PrivateServer, Servers};
 use tempfile::TempDir;
 
@@ -183,7 +183,7 @@ fn an_experiment_over_two_task_folders_is_reported_and_audited() {
     assert!(output.status.success(), "{}", stderr(&output));
     let plan = Plan::load(&place.path("out/plan.toml")).expect("a copy of the plan");
     assert_eq!(plan.tasks, ["arm", "dog"].map(|name| place.path(name).canonicalize().expect("a folder")));
-    let folder = Folder::new(&place.path("out"));
+    let folder = ExperimentFolder::new(&place.path("out"));
     for cell in &plan.cells {
         let Ok(CellState::Done(result)) = folder.state(cell) else { panic!("{} is not done", cell.id) };
         assert_eq!(result.training.model_hash.len(), 64);
@@ -215,7 +215,7 @@ fn results_of_different_models_are_not_reported_together() {
     let words = ["run", "plan.toml", "--out", "out"];
     place.printed(&words);
     let plan = Plan::load(&place.path("plan.toml")).expect("a plan");
-    let path = Folder::new(&place.path("out")).cell(&plan.cells[0].id).path().join("result.json");
+    let path = ExperimentFolder::new(&place.path("out")).cell(&plan.cells[0].id).path().join("result.json");
     let text = fs::read_to_string(&path).expect("a result");
     let mut result: serde_json::Value = serde_json::from_str(&text).expect("JSON");
     result["training"]["model_hash"] = "another".into();

@@ -22,7 +22,9 @@ use std::path::{Path, PathBuf};
 
 use perturb_files::checksum::WithChecksum;
 use perturb_files::{FileError, checksum, has_file, read_if_there, write_atomically};
-use perturb_policy::{Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, Weights};
+use perturb_policy::{
+    Inputs, Normalisers, ObservationNormaliser, Player, PlayerRole, PolicySpec, RewardNormaliser, Weights,
+};
 use perturb_protocol::proto;
 use perturb_settings::{Architecture, TrainConfig};
 use serde::{Deserialize, Serialize};
@@ -80,7 +82,7 @@ pub struct State {
 
 /// The state from which a training resumes, in addition to its policy.
 #[derive(Clone, Debug)]
-pub struct Resume {
+pub struct StoredResumeState {
     /// The file of the state's arrays. Its name begins with [`RESUME_PREFIX`].
     pub arrays: ArraysFile,
     /// The entry `resume` of `checkpoint.json`.
@@ -167,9 +169,10 @@ impl Checkpoint {
     ///
     /// # Errors
     /// [`CheckpointError::File`] if a file cannot be written. An earlier checkpoint then still exists.
-    pub fn save(&self, directory: &Path, resume: Option<Resume>) -> Result<()> {
+    pub fn save(&self, directory: &Path, resume: Option<StoredResumeState>) -> Result<()> {
         let iterations = self.state.counters.iterations;
-        let (resume_file, resume) = resume.map(|Resume { arrays, document }| (arrays.file, document)).unzip();
+        let (resume_file, resume) =
+            resume.map(|StoredResumeState { arrays, document }| (arrays.file, document)).unzip();
         let weights = encode_weights(&self.weights).map_err(|reason| damaged(directory, reason))?;
         let weights = ArraysFile::write(directory, WEIGHTS_PREFIX, iterations, &weights)?;
         let weights_file = weights.file.clone();
@@ -256,7 +259,7 @@ impl Checkpoint {
             rewards: state.reward_normaliser.clone(),
         };
         let episodes_per_trial = state.config.settings.episodes_per_trial();
-        let role = Role::testing(seed, first_environment_index, n_envs);
+        let role = PlayerRole::testing(seed, first_environment_index, n_envs);
         let mut player = Player::new(policy, state.inputs(n_envs), n_envs, episodes_per_trial, normalisers, role);
         if state.config.settings.is_random() {
             player = player.uniformly();

@@ -8,7 +8,7 @@ use perturb_records::TrainedOn;
 use perturb_records::statistics::{Summary, mean};
 use perturb_settings::Method;
 
-use crate::folder::{Folder, FolderError};
+use crate::folder::{ExperimentFolder, FolderError};
 use crate::selection::MethodResults;
 
 /// Minimum number of episodes that each point averages in the shortest run.
@@ -117,7 +117,10 @@ impl Curve {
 ///
 /// # Errors
 /// [`FolderError`] if a file exists but cannot be read.
-pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<Vec<EnvironmentCurves>, FolderError> {
+pub fn read_curves(
+    selections: &[MethodResults<'_>],
+    folder: &ExperimentFolder,
+) -> Result<Vec<EnvironmentCurves>, FolderError> {
     let mut all = Vec::new();
     for of_environment in selections.chunk_by(|a, b| a.environment == b.environment) {
         let mut curves = Vec::new();
@@ -138,7 +141,7 @@ pub fn read_curves(selections: &[MethodResults<'_>], folder: &Folder) -> Result<
 fn read_runs(
     selection: &MethodResults<'_>,
     version: Version,
-    folder: &Folder,
+    folder: &ExperimentFolder,
 ) -> Result<Vec<Vec<MonitorEpisode>>, FolderError> {
     let mut runs = Vec::new();
     for selected in selection.runs.values().filter_map(|run| run.cell_trained_on(TrainedOn::Version(version))) {

@@ -7,7 +7,7 @@ use perturb_records::outcomes::{Outcomes, SHARE, conditional_value_at_risk};
 use perturb_records::{Records, SCHEMA_VERSION, TableRow, TestResult};
 use perturb_settings::Method;
 
-use crate::folder::{CellFolder, CellResult, CellState, Folder, FolderError};
+use crate::folder::{CellFolder, CellResult, CellState, ExperimentFolder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::states::COMMIT_SEPARATOR;
 use crate::verify::{VerifyError, follows};
@@ -34,7 +34,7 @@ pub enum ExportError {
 /// [`ExportError`] if a file cannot be read, or a result contradicts its recorded episodes.
 pub fn export(
     plan: &Plan,
-    folder: &Folder,
+    folder: &ExperimentFolder,
     study: &str,
     mut each: impl FnMut(&str, Records),
 ) -> Result<Vec<TableRow>, ExportError> {

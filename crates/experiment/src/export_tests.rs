@@ -6,7 +6,7 @@ use perturb_records::{FILE, ParameterCheck, RecordedTest, RecordsMetadata, Resul
 
 use super::*;
 use crate::fixture;
-use crate::folder::{Failure, IntermediateEvaluation, Timing};
+use crate::folder::{FailureRecord, IntermediateEvaluation, Timing};
 use crate::selection::Results;
 use crate::states::{CellStates, DoneCells, LayeredStates, StudyResults};
 
@@ -35,7 +35,7 @@ fn records(successes: [u32; 3]) -> Records {
 
 /// Writes three of the plan's four cells: a result with marks and recorded episodes, a result without them, and a
 /// failure. The fourth cell is missing.
-fn write(plan: &Plan, folder: &Folder) {
+fn write(plan: &Plan, folder: &ExperimentFolder) {
     let [first, second, third, _] = &plan.cells[..] else { panic!("{} cells", plan.cells.len()) };
     let of = |records: &Records| {
         let tests = records.about.tests.iter().map(|test| test.set.name.clone());
@@ -57,12 +57,13 @@ fn write(plan: &Plan, folder: &Folder) {
     let mut result = fixture::result(second, [33.3, 66.7, 0.1], -1.0 / 3.0);
     result.training.counters = Counters { episodes: 15_000, timesteps: 9, ..Counters::default() };
     folder.cell(&second.id).write_result(&result).unwrap();
-    let failure = Failure { id: third.id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+    let failure =
+        FailureRecord { id: third.id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
     folder.cell(&third.id).write_failure(&failure).unwrap();
 }
 
 /// Writes the cells and exports them to a table. Returns the table after writing it to a file and reading it again.
-fn exported(plan: &Plan, folder: &Folder) -> ResultsTable {
+fn exported(plan: &Plan, folder: &ExperimentFolder) -> ResultsTable {
     write(plan, folder);
     let mut table = ResultsTable::default();
     let mut recorded = Vec::new();
@@ -77,7 +78,7 @@ fn exported(plan: &Plan, folder: &Folder) -> ResultsTable {
 #[test]
 fn a_row_has_every_number_of_a_test() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     let table = exported(&plan, &folder);
     let rows = table.rows();
     assert_eq!(rows.len(), 6 + 3 + 1);
@@ -96,7 +97,7 @@ fn a_row_has_every_number_of_a_test() {
 #[test]
 fn a_table_has_the_results_of_its_folder() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     let table = exported(&plan, &folder);
     let again = Plan::of_study("study", &table.studies["study"]).unwrap();
     assert_eq!(again.cells, plan.cells);
@@ -124,7 +125,7 @@ fn a_table_has_the_results_of_its_folder() {
 #[test]
 fn the_last_rows_are_the_final_policy_also_after_an_early_end() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     let cell = &plan.cells[0];
     let mut result = fixture::result(cell, [1.0, 2.0, 3.0], 0.0);
     result.training.counters = Counters { episodes: 300, timesteps: 2000, ..Counters::default() };
@@ -144,7 +145,7 @@ fn a_selected_cell_is_exported_once() {
     let directory = tempfile::tempdir().unwrap();
     let text = "environments = ['CartPole']\nversions = ['D']\nselection = 'clean'\ntuning_runs = 1\nruns = 1
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [64, 128] }";
-    let (plan, folder) = (Plan::parse("test", text.into()).unwrap(), Folder::new(directory.path()));
+    let (plan, folder) = (Plan::parse("test", text.into()).unwrap(), ExperimentFolder::new(directory.path()));
     for cell in plan.cells.iter().chain(&plan.candidates) {
         let mut result = fixture::result(cell, [50.0; 3], 0.0);
         result.results.insert(crate::SELECTION_TEST.into(), result.results["D"].clone());
@@ -159,7 +160,7 @@ fn a_selected_cell_is_exported_once() {
 #[test]
 fn results_of_another_plan_come_last() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     write(&plan, &folder);
     let mut result = fixture::result(&plan.cells[3], [1.0, 2.0, 3.0], 0.0);
     result.id = "A-of-another-plan".into();
@@ -173,7 +174,7 @@ fn results_of_another_plan_come_last() {
 #[test]
 fn done_cells_have_the_same_settings_and_tests() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     let table = exported(&plan, &folder);
     let done = DoneCells::new(&table).unwrap();
     let is_done = |cell: &Cell| matches!(done.state(cell).unwrap(), CellState::Done(_));
@@ -182,7 +183,7 @@ fn done_cells_have_the_same_settings_and_tests() {
     other_tests.tests.episodes += 1;
     assert!(!is_done(&other_tests), "tested with another number of episodes");
     let empty = tempfile::tempdir().unwrap();
-    let empty = Folder::new(empty.path());
+    let empty = ExperimentFolder::new(empty.path());
     let both = LayeredStates { first: &empty, then: Some(&done) };
     assert!(matches!(both.state(&plan.cells[0]).unwrap(), CellState::Done(_)));
     let both = LayeredStates { first: &folder, then: Some(&done) };
@@ -192,7 +193,7 @@ fn done_cells_have_the_same_settings_and_tests() {
 #[test]
 fn a_result_that_its_episodes_do_not_give_is_not_exported() {
     let directory = tempfile::tempdir().unwrap();
-    let (plan, folder) = (plan(), Folder::new(directory.path()));
+    let (plan, folder) = (plan(), ExperimentFolder::new(directory.path()));
     write(&plan, &folder);
     records([9, 9, 3]).write(&folder.cell(&plan.cells[0].id).path().join(FILE)).unwrap();
     let message = export(&plan, &folder, "study", |_, _| {}).unwrap_err().to_string();

@@ -39,7 +39,7 @@ const MAX_BYTES: u64 = 64 << 20;
 
 /// The folder of an experiment: its plan and the folders of its cells.
 #[derive(Clone, Debug)]
-pub struct Folder {
+pub struct ExperimentFolder {
     path: PathBuf,
     /// The folder to which new heatmaps are written; `None` for the experiment's own folder `heatmaps`.
     new_heatmaps: Option<PathBuf>,
@@ -66,7 +66,7 @@ pub enum CellState {
     /// The cell has a result.
     Done(Box<CellResult>),
     /// The cell failed, and has no result.
-    Failed(Failure),
+    Failed(FailureRecord),
     /// The cell has neither a result nor a failure.
     Missing,
 }
@@ -145,7 +145,7 @@ pub struct Training {
 /// The content of `failure.json`: why a cell failed.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct Failure {
+pub struct FailureRecord {
     /// The id of the cell.
     pub id: String,
     /// The error with its causes.
@@ -213,7 +213,7 @@ pub enum FolderError {
 
 type Result<T> = std::result::Result<T, FolderError>;
 
-impl Folder {
+impl ExperimentFolder {
     /// Returns the folder at `path`, which need not exist.
     pub fn new(path: &Path) -> Self {
         Self { path: path.to_owned(), new_heatmaps: None }
@@ -383,20 +383,20 @@ impl CellFolder {
     ///
     /// # Errors
     /// [`FileError`] if the file cannot be written.
-    pub fn write_failure(&self, failure: &Failure) -> files::Result<()> {
+    pub fn write_failure(&self, failure: &FailureRecord) -> files::Result<()> {
         write(&self.path.join("failure.json"), failure)
     }
 
     /// Deletes the failure record. Also deletes the training that failed if another attempt [must restart
-    /// it](Failure::requires_restart).
+    /// it](FailureRecord::requires_restart).
     ///
     /// # Errors
     /// [`FileError`] if the failure record cannot be read; nothing is deleted then.
     pub fn clear_failure(&self) -> files::Result<()> {
         let path = self.path.join("failure.json");
-        match read::<Failure>(&path) {
+        match read::<FailureRecord>(&path) {
             Ok(None) => return Ok(()),
-            Ok(Some(Failure { requires_restart: false, .. })) => {}
+            Ok(Some(FailureRecord { requires_restart: false, .. })) => {}
             Err(FolderError::File(error)) => return Err(error),
             Ok(Some(_)) | Err(_) => files::delete(&self.training())?,
         }
@@ -504,9 +504,10 @@ mod tests {
     #[test]
     fn a_result_reads_back_and_beats_a_failure() {
         let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
+        let cell = ExperimentFolder::new(directory.path()).cell("a");
         assert_eq!(cell.state().unwrap(), CellState::Missing);
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+        let failure =
+            FailureRecord { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
         cell.write_failure(&failure).unwrap();
         assert_eq!(cell.state().unwrap(), CellState::Failed(failure));
         assert!(cell.is_settled(true) && !cell.is_settled(false));
@@ -521,7 +522,7 @@ mod tests {
     #[test]
     fn training_is_deleted_only_with_numerical_failures() {
         let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
+        let cell = ExperimentFolder::new(directory.path()).cell("a");
         let earlier = r#"{"id": "a", "reason": "NaN", "commit": "x"}"#;
         for (failure, stays) in [
             (serde_json::json!({"id": "a", "reason": "another revision", "commit": "x", "begins_anew": false}), true),
@@ -541,8 +542,9 @@ mod tests {
     #[test]
     fn a_failure_recorded_again_is_another_one() {
         let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
-        let failure = Failure { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+        let cell = ExperimentFolder::new(directory.path()).cell("a");
+        let failure =
+            FailureRecord { id: "a".into(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
         assert_eq!(cell.failure_id(), None);
         cell.write_failure(&failure).unwrap();
         let first = cell.failure_id().unwrap();
@@ -561,7 +563,7 @@ mod tests {
     #[test]
     fn a_damaged_result_is_named_not_taken_for_missing() {
         let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
+        let cell = ExperimentFolder::new(directory.path()).cell("a");
         for (text, part) in [("{", "EOF"), ("{}", "missing field"), ("[]", "invalid")] {
             write_atomically(&cell.path().join("result.json"), text.as_bytes()).unwrap();
             let message = cell.state().unwrap_err().to_string();
@@ -574,7 +576,7 @@ mod tests {
     #[test]
     fn changed_result_is_refused_and_old_format_is_read() {
         let directory = tempfile::tempdir().unwrap();
-        let cell = Folder::new(directory.path()).cell("a");
+        let cell = ExperimentFolder::new(directory.path()).cell("a");
         cell.write_result(&result()).unwrap();
         let path = cell.path().join("result.json");
         let text = fs::read_to_string(&path).unwrap();
@@ -589,7 +591,7 @@ mod tests {
     #[test]
     fn the_plan_is_kept_and_its_change_noticed() {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(&directory.path().join("new"));
+        let folder = ExperimentFolder::new(&directory.path().join("new"));
         assert!(folder.require_plan().unwrap_err().to_string().contains("holds no experiment"));
         let plan = |environment: &str| {
             let text = format!("environments = ['{environment}']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");

@@ -19,7 +19,7 @@ use perturb_records::{Axis, Heatmap, HeatmapKind, HeatmapOptions, TrainedOn, hea
 use perturb_settings::Method;
 use serde::{Deserialize, Serialize};
 
-use crate::folder::{Folder, FolderError};
+use crate::folder::{ExperimentFolder, FolderError};
 use crate::plan::Cell;
 use crate::selection::{MethodResults, Selected};
 
@@ -116,7 +116,7 @@ pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPla
 /// # Errors
 /// Errors of the operating system.
 pub fn heatmap_kinds<'a>(
-    folder: &Folder,
+    folder: &ExperimentFolder,
     places: &[HeatmapPlace<'a>],
 ) -> files::Result<BTreeMap<&'a str, BTreeSet<HeatmapKind>>> {
     let ids = places.iter().filter_map(|place| Some((place.selected?.cell.id.as_str(), place.environment)));
@@ -148,7 +148,11 @@ impl HeatmapPlace<'_> {
     ///
     /// # Errors
     /// [`FolderError`] if a file exists but cannot be read.
-    pub fn read(&self, folder: &Folder, kind: &HeatmapKind) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
+    pub fn read(
+        &self,
+        folder: &ExperimentFolder,
+        kind: &HeatmapKind,
+    ) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
         let Some(Selected { cell, .. }) = self.selected else { return Ok(Err(NoHeatmap::NoResult)) };
         let mut missing = NoHeatmap::NotMade;
         for path in folder.heatmaps() {
@@ -165,7 +169,7 @@ impl HeatmapPlace<'_> {
     fn read_at(
         &self,
         path: &Path,
-        folder: &Folder,
+        folder: &ExperimentFolder,
         cell: &Cell,
         kind: &HeatmapKind,
     ) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
@@ -199,7 +203,7 @@ impl std::fmt::Display for HeatmapPlace<'_> {
 }
 
 /// Returns the path, without extension, to which a new heatmap of `cell` is written.
-pub fn heatmap_path(folder: &Folder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
+pub fn heatmap_path(folder: &ExperimentFolder, cell: &Cell, kind: &HeatmapKind) -> PathBuf {
     folder.heatmaps().swap_remove(0).join(heatmap_name(cell, kind))
 }
 
@@ -213,7 +217,7 @@ fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
 /// # Errors
 /// Errors of the operating system. The folder then has no heatmap of this kind for the cell.
 pub fn store_heatmap(
-    folder: &Folder,
+    folder: &ExperimentFolder,
     cell: &Cell,
     checkpoint: String,
     options: HeatmapOptions,
@@ -240,7 +244,7 @@ pub fn store_heatmap(
 }
 
 /// Returns the checksum of a cell's `result.json`; `None` if there is no such file.
-fn result_checksum(folder: &Folder, cell: &Cell) -> files::Result<Option<String>> {
+fn result_checksum(folder: &ExperimentFolder, cell: &Cell) -> files::Result<Option<String>> {
     Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }
 
@@ -273,7 +277,7 @@ mod tests {
     fn a_heatmap_is_current_only_while_it_and_its_result_are_whole() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let cell = &plan.cells[0];
         let result = folder.cell(&cell.id).path().join("result.json");
         write_atomically(&result, b"{}").unwrap();
@@ -339,7 +343,7 @@ mod tests {
     fn heatmaps_of_several_kinds_stand_beside_each_other() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
         let selections = results.select();
         let places = heatmap_places(&selections);

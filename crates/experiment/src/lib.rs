@@ -1,7 +1,7 @@
 //! Experiments: plans, execution and results.
 //!
-//! - [`Plan`] expands an experiment file to cells: one training with its tests each. [`Folder`] stores the results of
-//!   cells, and [`scheduler`] runs cells in local processes or on a Slurm cluster.
+//! - [`Plan`] expands an experiment file to cells: one training with its tests each. [`ExperimentFolder`] stores the
+//!   results of cells, and [`scheduler`] runs cells in local processes or on a Slurm cluster.
 //! - [`runs`] finds trainings and experiments, and reports their progress.
 //! - [`Results`] reads the results of cells and selects the best configurations. [`export`](export()) turns results
 //!   into rows of a table.
@@ -35,8 +35,8 @@ pub use eta::{CellDurations, RemainingTime, TrainingProgress};
 pub use export::{ExportError, export};
 pub use external::{add_assessed, elsewhere, judged_as_in};
 pub use folder::{
-    CellFolder, CellResult, CellState, Failure, FailureId, Folder, FolderError, IntermediateEvaluation, Timing,
-    Training,
+    CellFolder, CellResult, CellState, ExperimentFolder, FailureId, FailureRecord, FolderError, IntermediateEvaluation,
+    Timing, Training,
 };
 pub use heatmaps::{
     HeatmapPlace, HeatmapRecord, NoHeatmap, StoredHeatmap, heatmap_kinds, heatmap_path, heatmap_places, store_heatmap,

@@ -17,7 +17,7 @@ use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mea
 use perturb_records::{ExternalEvaluation, ExternalPolicy, Metric, Scenario, TestResult, TrainedOn};
 use perturb_settings::Method;
 
-use crate::folder::{CellResult, CellState, Failure, FolderError};
+use crate::folder::{CellResult, CellState, FailureRecord, FolderError};
 use crate::plan::{Cell, Plan, Selection};
 use crate::states::CellStates;
 use crate::tuning::{Tuned, tuned};
@@ -127,7 +127,7 @@ impl<'a> Results<'a> {
     }
 
     /// Returns the failures of cells in the plan's order.
-    pub fn failures(&self) -> impl Iterator<Item = &Failure> {
+    pub fn failures(&self) -> impl Iterator<Item = &FailureRecord> {
         self.states.iter().filter_map(|state| match state {
             CellState::Failed(failure) => Some(failure),
             _ => None,

@@ -6,7 +6,9 @@ use std::path::Path;
 use perturb_checkpoint::Counters;
 use perturb_records::{ParameterCheck, ResultsTable, StudyPlan, TableRow, TestResult};
 
-use crate::folder::{CellResult, CellState, Failure, Folder, FolderError, IntermediateEvaluation, Training};
+use crate::folder::{
+    CellResult, CellState, ExperimentFolder, FailureRecord, FolderError, IntermediateEvaluation, Training,
+};
 use crate::plan::{Cell, Plan, PlanError};
 
 /// Separator between the program versions in the column `commit` of a results table.
@@ -21,7 +23,7 @@ pub trait CellStates {
     fn state(&self, cell: &Cell) -> Result<CellState, FolderError>;
 }
 
-impl Folder {
+impl ExperimentFolder {
     /// Reads the state of `cell`.
     ///
     /// # Errors
@@ -31,7 +33,7 @@ impl Folder {
     }
 }
 
-impl CellStates for Folder {
+impl CellStates for ExperimentFolder {
     fn state(&self, cell: &Cell) -> Result<CellState, FolderError> {
         Self::state(self, cell)
     }
@@ -144,7 +146,7 @@ fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
     let (commit, earlier) = commits.split_last().ok_or("it names no program")?;
     if let Some(reason) = &last.failure {
         let (id, reason, commit) = (cell.id.clone(), reason.clone(), commit.clone());
-        return Ok(CellState::Failed(Failure { id, reason, commit, requires_restart: true }));
+        return Ok(CellState::Failed(FailureRecord { id, reason, commit, requires_restart: true }));
     }
     // The rows of the final policy are the last ones with the same number of episodes and without a repeated test set.
     let first_of_final = rows.iter().enumerate().rposition(|(place, row)| {

@@ -3,8 +3,8 @@ use rstest::rstest;
 
 use super::*;
 use crate::fixture;
-use crate::folder::Failure;
-use crate::folder::Folder;
+use crate::folder::ExperimentFolder;
+use crate::folder::FailureRecord;
 use crate::plan::Selection;
 use crate::selection::Results;
 
@@ -38,7 +38,7 @@ type SelectionResultFn = fn(&str, u64) -> Option<(f64, f64)>;
 
 /// Writes the results that `known` returns. Cells for which it returns `None` have failed if `failed` is set, and are
 /// missing otherwise.
-fn done(plan: &Plan, folder: &Folder, known: SelectionResultFn, failed: bool) {
+fn done(plan: &Plan, folder: &ExperimentFolder, known: SelectionResultFn, failed: bool) {
     for cell in &plan.cells {
         let place = folder.cell(&cell.id);
         match known(if is_a(cell) { "A" } else { "B" }, cell.config.common.seed) {
@@ -52,8 +52,12 @@ fn done(plan: &Plan, folder: &Folder, known: SelectionResultFn, failed: bool) {
                 place.write_result(&result).unwrap();
             }
             None if failed => {
-                let failure =
-                    Failure { id: cell.id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+                let failure = FailureRecord {
+                    id: cell.id.clone(),
+                    reason: "NaN".into(),
+                    commit: "x".into(),
+                    requires_restart: true,
+                };
                 place.write_failure(&failure).unwrap();
             }
             None => {}
@@ -61,9 +65,9 @@ fn done(plan: &Plan, folder: &Folder, known: SelectionResultFn, failed: bool) {
     }
 }
 
-fn place() -> (tempfile::TempDir, Folder) {
+fn place() -> (tempfile::TempDir, ExperimentFolder) {
     let directory = tempfile::tempdir().unwrap();
-    let folder = Folder::new(directory.path());
+    let folder = ExperimentFolder::new(directory.path());
     (directory, folder)
 }
 

@@ -69,7 +69,7 @@ mod tests {
 
     use super::*;
     use crate::fixture;
-    use crate::folder::{CellState, Folder};
+    use crate::folder::{CellState, ExperimentFolder};
     use crate::plan::Plan;
     use perturb_protocol::Version;
     use perturb_records::{Ending, EpisodeRecord, RecordedTest, RecordsMetadata};
@@ -118,7 +118,7 @@ mod tests {
     fn a_result_is_that_of_its_recorded_episodes(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let records = records();
         records.write(&folder.cell(&plan.cells[0].id).path().join(perturb_records::FILE)).unwrap();
         let mut results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));

@@ -1,6 +1,6 @@
 //! Simulations: a model and the data that MuJoCo computes for it.
 
-use crate::{Error, Field, Model, Reading, Warning, model::last_error, sys};
+use crate::{DataField, Error, Model, ModelField, Warning, model::last_error, sys};
 use std::{
     ffi::c_int,
     ptr::{self, NonNull},
@@ -8,7 +8,7 @@ use std::{
 };
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Status {
+enum SimulationStatus {
     Sound,
     /// MuJoCo raised this warning. Calls that compute are refused until the next reset.
     Diverged(Warning),
@@ -34,7 +34,7 @@ pub struct Simulation {
     /// The pairs of geoms that can touch, for [`Simulation::step_without_search`]. They point to arrays of `model`.
     /// `self` owns them, and `drop` frees them. `None` if the model needs MuJoCo's search for nearby geoms.
     pairs: Option<NonNull<sys::perturb_mj_pairs>>,
-    status: Status,
+    status: SimulationStatus,
 }
 
 // SAFETY: mjData and the pairs are plain memory without ties to a thread, and only `Simulation` owns them. A call uses
@@ -53,7 +53,7 @@ impl Simulation {
         // SAFETY: the model is valid, and the function only reads it. The pairs point into the model's memory, which
         // does not move and lives as long as the pairs. The function returns new memory or null.
         let pairs = NonNull::new(unsafe { sys::perturb_mj_make_pairs(model.as_ptr()) });
-        Ok(Self { model, data, pairs, status: Status::Sound })
+        Ok(Self { model, data, pairs, status: SimulationStatus::Sound })
     }
 
     /// The model, including edits such as those by [`field_mut`](Self::field_mut).
@@ -71,7 +71,7 @@ impl Simulation {
     /// If a size differs, see [`Model::has_sizes_of`].
     pub fn set_model(&mut self, source: &Model) -> Result<(), Error> {
         assert!(self.model.has_sizes_of(source), "the model has other sizes");
-        if self.status == Status::Poisoned {
+        if self.status == SimulationStatus::Poisoned {
             return Err(Error::Poisoned);
         }
         // SAFETY: both models are valid and have the same sizes. `&mut self` excludes other users of the model that is
@@ -106,7 +106,7 @@ impl Simulation {
     }
 
     /// Copies the values of `fields` to `out`, one field after the other: [`Model::n_fields`] numbers.
-    pub fn fields(&self, fields: &[Field], out: &mut [f64]) {
+    pub fn fields(&self, fields: &[ModelField], out: &mut [f64]) {
         assert_eq!(out.len(), self.model.n_fields(fields), "the fields of another model");
         let mut rest = out;
         for field in fields {
@@ -116,7 +116,7 @@ impl Simulation {
     }
 
     /// Restores the values that [`fields`](Self::fields) copied from this or another simulation of the same model.
-    pub fn set_fields(&mut self, fields: &[Field], values: &[f64]) {
+    pub fn set_fields(&mut self, fields: &[ModelField], values: &[f64]) {
         assert_eq!(values.len(), self.model.n_fields(fields), "the fields of another model");
         let mut rest = values;
         for field in fields {
@@ -127,7 +127,7 @@ impl Simulation {
 
     /// The values of a field of the model, for editing. Call [`set_const`](Self::set_const) after editing masses,
     /// inertias, armatures or gears.
-    pub fn field_mut(&mut self, field: Field) -> &mut [f64] {
+    pub fn field_mut(&mut self, field: ModelField) -> &mut [f64] {
         let (start, length) = self.model.place(field);
         self.array_mut(start, length)
     }
@@ -158,13 +158,13 @@ impl Simulation {
     }
 
     /// Recomputes the arrays of the model that follow from edited arrays, such as the masses of subtrees. Overwrites
-    /// the positions, so reset or set the state afterwards. Also overwrites [`Field::Statistic`], even if the MJCF text
-    /// sets it explicitly.
+    /// the positions, so reset or set the state afterwards. Also overwrites [`ModelField::Statistic`], even if the MJCF
+    /// text sets it explicitly.
     ///
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
     pub fn set_const(&mut self) -> Result<(), Error> {
-        if self.status == Status::Poisoned {
+        if self.status == SimulationStatus::Poisoned {
             return Err(Error::Poisoned);
         }
         // SAFETY: `data` belongs to `model`, and no fatal error has damaged it. `&mut self` excludes other users of
@@ -181,14 +181,14 @@ impl Simulation {
     /// # Errors
     /// [`Error::Fatal`], [`Error::Poisoned`].
     pub fn reset(&mut self) -> Result<(), Error> {
-        if self.status == Status::Poisoned {
+        if self.status == SimulationStatus::Poisoned {
             return Err(Error::Poisoned);
         }
         // SAFETY: `data` belongs to `model`, and no fatal error has damaged it. `&mut self` excludes other users of
         // both.
         let failed = unsafe { sys::perturb_mj_reset(self.model.as_ptr(), self.data.as_ptr()) };
         self.poison_if(failed)?;
-        self.status = Status::Sound;
+        self.status = SimulationStatus::Sound;
         Ok(())
     }
 
@@ -262,7 +262,7 @@ impl Simulation {
         } else {
             return Ok(());
         };
-        self.status = Status::Diverged(warning);
+        self.status = SimulationStatus::Diverged(warning);
         Err(Error::Diverged { warning })
     }
 
@@ -274,8 +274,8 @@ impl Simulation {
         self.run(sys::perturb_mj_kinematics)
     }
 
-    /// Computes [`Reading::BodyExternalForces`]. [`step`](Self::step) and [`forward`](Self::forward) compute them only
-    /// if a sensor of the model needs them.
+    /// Computes [`DataField::BodyExternalForces`]. [`step`](Self::step) and [`forward`](Self::forward) compute them
+    /// only if a sensor of the model needs them.
     ///
     /// # Errors
     /// [`Error::Diverged`], [`Error::Fatal`], [`Error::Poisoned`].
@@ -283,15 +283,15 @@ impl Simulation {
         self.run(sys::perturb_mj_rne_post_constraint)
     }
 
-    /// Sets [`Reading::BodyExternalForces`] to 0, its value after [`reset`](Self::reset).
+    /// Sets [`DataField::BodyExternalForces`] to 0, its value after [`reset`](Self::reset).
     pub fn clear_external_forces(&mut self) {
-        let (start, length) = Reading::BodyExternalForces.place(self.raw(), self.model.raw());
+        let (start, length) = DataField::BodyExternalForces.place(self.raw(), self.model.raw());
         self.array_mut(start, length).fill(0.0);
     }
 
     /// Whether a fatal error made the simulation unusable.
     pub fn is_poisoned(&self) -> bool {
-        self.status == Status::Poisoned
+        self.status == SimulationStatus::Poisoned
     }
 
     /// The number of times that MuJoCo raised `warning` since the last reset.
@@ -309,9 +309,9 @@ impl Simulation {
     /// of model and data.
     fn run_with(&mut self, call: impl FnOnce(*const sys::mjModel, *mut sys::mjData) -> c_int) -> Result<(), Error> {
         match self.status {
-            Status::Sound => {}
-            Status::Diverged(warning) => return Err(Error::Diverged { warning }),
-            Status::Poisoned => return Err(Error::Poisoned),
+            SimulationStatus::Sound => {}
+            SimulationStatus::Diverged(warning) => return Err(Error::Diverged { warning }),
+            SimulationStatus::Poisoned => return Err(Error::Poisoned),
         }
         let failed = call(self.model.as_ptr(), self.data.as_ptr());
         self.poison_if(failed)?;
@@ -319,7 +319,7 @@ impl Simulation {
         match Warning::ALL.into_iter().find(|&warning| self.warnings(warning) != 0) {
             None => Ok(()),
             Some(warning) => {
-                self.status = Status::Diverged(warning);
+                self.status = SimulationStatus::Diverged(warning);
                 Err(Error::Diverged { warning })
             }
         }
@@ -329,7 +329,7 @@ impl Simulation {
         if failed == 0 {
             return Ok(());
         }
-        self.status = Status::Poisoned;
+        self.status = SimulationStatus::Poisoned;
         Err(last_error())
     }
 
@@ -355,7 +355,7 @@ impl Simulation {
     /// [`Error::Fatal`], [`Error::Poisoned`].
     pub fn set_state(&mut self, state: &[f64]) -> Result<(), Error> {
         assert_eq!(state.len(), self.model.n_state(), "the state of another model");
-        if self.status != Status::Sound {
+        if self.status != SimulationStatus::Sound {
             self.reset()?; // a sound simulation has no warnings to clear, and its steps overwrite all else
         }
         // SAFETY: `data` is valid for the lifetime of `self`, and `&mut self` excludes other users.
@@ -436,7 +436,7 @@ impl Simulation {
     // ---- quantities that step1 computes
 
     /// The values of an array that MuJoCo computed.
-    pub fn reading(&self, reading: Reading) -> &[f64] {
+    pub fn reading(&self, reading: DataField) -> &[f64] {
         let (start, length) = reading.place(self.raw(), self.model.raw());
         self.array(start, length)
     }

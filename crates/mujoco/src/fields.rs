@@ -30,7 +30,7 @@ macro_rules! float_fields {
     ($($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)*) => {
         /// A floating-point array of a model, or one of its numeric options.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-        pub enum Field {
+        pub enum ModelField {
             $($(#[$doc])* $field,)*
             /// Gravity in m/s², `[3]`.
             Gravity,
@@ -45,7 +45,7 @@ macro_rules! float_fields {
             Statistic,
         }
 
-        impl Field {
+        impl ModelField {
             /// A pointer to the first element of the array in this model, and the number of elements.
             ///
             /// # Safety
@@ -147,19 +147,19 @@ float_fields! {
 }
 
 /// The fields with masses, inertias and friction, and all fields that mj_setConst derives from masses and inertias.
-pub(crate) const CONSTANTS: [Field; 9] = [
-    Field::BodyMass,
-    Field::BodyInertia,
-    Field::GeomFriction,
-    Field::BodySubtreeMass,
-    Field::BodyInvWeight,
-    Field::DofInvWeight,
-    Field::DofInertia,
-    Field::ActuatorAcceleration,
-    Field::Statistic,
+pub(crate) const CONSTANTS: [ModelField; 9] = [
+    ModelField::BodyMass,
+    ModelField::BodyInertia,
+    ModelField::GeomFriction,
+    ModelField::BodySubtreeMass,
+    ModelField::BodyInvWeight,
+    ModelField::DofInvWeight,
+    ModelField::DofInertia,
+    ModelField::ActuatorAcceleration,
+    ModelField::Statistic,
 ];
 
-impl Field {
+impl ModelField {
     /// The fields that [`Simulation::set_const`](crate::Simulation::set_const) derives from other fields and that
     /// affect the physics.
     pub const DERIVED: [Self; 9] = [
@@ -277,11 +277,11 @@ macro_rules! data_arrays {
     ($($(#[$doc:meta])* $field:ident = $raw:ident: $length:expr,)*) => {
         /// An array of a simulation: the state, or a quantity that MuJoCo computes.
         #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
-        pub enum Reading {
+        pub enum DataField {
             $($(#[$doc])* $field,)*
         }
 
-        impl Reading {
+        impl DataField {
             /// A pointer to the first element of the array in the data `d` of the model `m`, and the number of
             /// elements.
             pub(crate) fn place(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {

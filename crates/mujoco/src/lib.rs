@@ -2,16 +2,16 @@
 //!
 //! - [`Model`]: a compiled model. It is compiled from MJCF, MuJoCo's XML format, or copied from another model.
 //! - [`Simulation`]: a copy of a model, which may be edited, and the physical state that MuJoCo computes for it.
-//! - [`Field`], [`Index`], [`Flags`] and [`Reading`]: the names of the arrays of models and simulations.
-//! - [`Renderer`]: draws pictures of a model without a display.
+//! - [`ModelField`], [`Index`], [`Flags`] and [`DataField`]: the names of the arrays of models and simulations.
+//! - [`ModelRenderer`]: draws pictures of a model without a display.
 //! - [`Error`], [`Warning`]: MuJoCo's failures. Fatal errors are returned instead of ending the process, and warnings
 //!   are reported as errors.
 //!
 //! ```
-//! use perturb_mujoco::{Kind, Model, Simulation};
+//! use perturb_mujoco::{ElementKind, Model, Simulation};
 //!
 //! let model = Model::from_xml("<mujoco><worldbody><body name='ball'><freejoint/><geom size='.1'/></body></worldbody></mujoco>")?;
-//! let ball = model.id(Kind::Body, "ball")?;
+//! let ball = model.id(ElementKind::Body, "ball")?;
 //! let mut simulation = Simulation::new(model)?;
 //! simulation.step1()?;
 //! simulation.step2()?;
@@ -45,6 +45,6 @@ mod sys;
 
 pub use data::Simulation;
 pub use error::{Error, Warning};
-pub use fields::{Field, Flags, Index, Options, Reading};
-pub use model::{FloatArray, Kind, Model};
-pub use render::{Camera, CameraView, Renderer};
+pub use fields::{DataField, Flags, Index, ModelField, Options};
+pub use model::{ElementKind, Model, ModelArray};
+pub use render::{Camera, CameraView, ModelRenderer};

@@ -2,7 +2,7 @@
 
 use crate::{
     Error,
-    fields::{CONSTANTS, Field, Flags, Index, Options},
+    fields::{CONSTANTS, Flags, Index, ModelField, Options},
     sys,
 };
 use std::{
@@ -20,7 +20,7 @@ const MAX_FILE_NAME: usize = 900;
 
 /// A kind of model element that can have a name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Kind {
+pub enum ElementKind {
     /// A rigid body. Body 0 is the world.
     Body,
     /// A joint, by which a body moves relative to its parent.
@@ -43,7 +43,7 @@ pub enum Kind {
     Keyframe,
 }
 
-impl Kind {
+impl ElementKind {
     /// The name of this kind in MJCF, e.g. "joint".
     pub fn name(self) -> &'static str {
         match self {
@@ -93,7 +93,7 @@ unsafe impl Sync for Model {}
 
 /// A floating-point array of a model.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FloatArray {
+pub struct ModelArray {
     /// MuJoCo's name of the field, e.g. `body_mass`.
     pub name: &'static str,
     /// The elements, row-major. Single-precision numbers are converted to double precision.
@@ -183,7 +183,7 @@ impl Model {
     ///
     /// # Errors
     /// [`Error::UnknownName`] if there is no such element.
-    pub fn id(&self, kind: Kind, name: &str) -> Result<usize, Error> {
+    pub fn id(&self, kind: ElementKind, name: &str) -> Result<usize, Error> {
         let unknown = || Error::UnknownName { kind: kind.name(), name: name.to_owned() };
         let c_name = CString::new(name).map_err(|_| unknown())?;
         // SAFETY: the model is valid, the string is terminated, and the function only reads both.
@@ -192,7 +192,7 @@ impl Model {
     }
 
     /// The name of the element with this kind and index. `None` if it has no name, or if there is no such element.
-    pub fn name(&self, kind: Kind, id: usize) -> Option<&str> {
+    pub fn name(&self, kind: ElementKind, id: usize) -> Option<&str> {
         if id >= self.count(kind) {
             return None;
         }
@@ -207,19 +207,19 @@ impl Model {
     }
 
     /// The number of elements of this kind.
-    pub fn count(&self, kind: Kind) -> usize {
+    pub fn count(&self, kind: ElementKind) -> usize {
         let m = self.raw();
         (match kind {
-            Kind::Body => m.nbody,
-            Kind::Joint => m.njnt,
-            Kind::Geom => m.ngeom,
-            Kind::Actuator => m.nu,
-            Kind::Site => m.nsite,
-            Kind::Camera => m.ncam,
-            Kind::Sensor => m.nsensor,
-            Kind::Tendon => m.ntendon,
-            Kind::Pair => m.npair,
-            Kind::Keyframe => m.nkey,
+            ElementKind::Body => m.nbody,
+            ElementKind::Joint => m.njnt,
+            ElementKind::Geom => m.ngeom,
+            ElementKind::Actuator => m.nu,
+            ElementKind::Site => m.nsite,
+            ElementKind::Camera => m.ncam,
+            ElementKind::Sensor => m.nsensor,
+            ElementKind::Tendon => m.ntendon,
+            ElementKind::Pair => m.npair,
+            ElementKind::Keyframe => m.nkey,
         }) as usize
     }
 
@@ -304,18 +304,18 @@ impl Model {
     }
 
     /// The values of a floating-point array or option.
-    pub fn field(&self, field: Field) -> &[f64] {
+    pub fn field(&self, field: ModelField) -> &[f64] {
         let (start, length) = self.place(field);
         self.array(start, length)
     }
 
     /// The total number of elements in `fields`.
-    pub fn n_fields(&self, fields: &[Field]) -> usize {
+    pub fn n_fields(&self, fields: &[ModelField]) -> usize {
         fields.iter().map(|&field| self.place(field).1).sum()
     }
 
     /// A pointer to the first element of a field, and the number of its elements.
-    pub(crate) fn place(&self, field: Field) -> (*mut f64, usize) {
+    pub(crate) fn place(&self, field: ModelField) -> (*mut f64, usize) {
         // SAFETY: the pointer is a valid model for the lifetime of `self`, and is not written through a `&Model`.
         unsafe { field.place(self.as_ptr()) }
     }
@@ -370,7 +370,7 @@ impl Model {
 
     /// Copies every floating-point array of the model, and its statistics under the name `stat`. Meant for comparing
     /// models.
-    pub fn float_arrays(&self) -> Vec<FloatArray> {
+    pub fn float_arrays(&self) -> Vec<ModelArray> {
         let mut arrays = Vec::new();
         for index in 0.. {
             let (mut name, mut elements, mut count, mut size) = (ptr::null(), ptr::null(), 0, 0);
@@ -396,7 +396,7 @@ impl Model {
             };
             // SAFETY: the name is a string literal in `shim.c`, so it is terminated and never freed.
             let name = unsafe { CStr::from_ptr::<'static>(name) }.to_str().unwrap_or_default();
-            arrays.push(FloatArray { name, values });
+            arrays.push(ModelArray { name, values });
         }
         arrays
     }

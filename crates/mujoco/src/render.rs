@@ -1,6 +1,6 @@
 //! Draws pictures of a model into memory.
 
-use crate::{Error, Kind, Model, Simulation, gl::Gl, model::last_error, sys};
+use crate::{ElementKind, Error, Model, Simulation, gl::Gl, model::last_error, sys};
 use std::{
     ffi::c_int,
     mem::{self, MaybeUninit},
@@ -37,7 +37,7 @@ pub enum CameraView {
 
 /// Draws pictures of one model into memory. It can only be used in the thread that created it, because it has an OpenGL
 /// context.
-pub struct Renderer {
+pub struct ModelRenderer {
     gl: Gl,
     simulation: Simulation,
     option: Box<sys::mjvOption>,
@@ -58,7 +58,7 @@ fn exclusive() -> MutexGuard<'static, ()> {
     DRAWING.lock().unwrap_or_else(PoisonError::into_inner) // a poisoned mutex is harmless: it guards no data
 }
 
-impl Renderer {
+impl ModelRenderer {
     /// Creates a renderer of `model` in its initial pose. `size` is the expected width and height of the pictures in
     /// pixels. Larger pictures are possible, but the first larger picture takes longer.
     ///
@@ -119,7 +119,7 @@ impl Renderer {
                 elevation,
             },
             CameraView::Fixed(number) => {
-                if number >= self.simulation.model().count(Kind::Camera) {
+                if number >= self.simulation.model().count(ElementKind::Camera) {
                     return Err(Error::Fatal { message: format!("the model has no camera number {number}") });
                 }
                 sys::mjvCamera {
@@ -192,7 +192,7 @@ impl Renderer {
     }
 }
 
-impl Drop for Renderer {
+impl Drop for ModelRenderer {
     fn drop(&mut self) {
         let drawing = self.enter();
         // SAFETY: the context was made in `gl`, which is current, and the scene was made for the model. Both are freed
@@ -211,8 +211,8 @@ impl Drop for Renderer {
 /// decorations of each joint, actuator and tendon.
 fn scene_geoms(model: &Model) -> c_int {
     let count = |kind| model.count(kind);
-    let decorations = 4 * (count(Kind::Joint) + count(Kind::Actuator)) + 50 * count(Kind::Tendon);
-    let all = 2 * (count(Kind::Geom) + count(Kind::Site)) + decorations;
+    let decorations = 4 * (count(ElementKind::Joint) + count(ElementKind::Actuator)) + 50 * count(ElementKind::Tendon);
+    let all = 2 * (count(ElementKind::Geom) + count(ElementKind::Site)) + decorations;
     all.clamp(MIN_SCENE_GEOMS, MAX_SCENE_GEOMS) as c_int
 }
 

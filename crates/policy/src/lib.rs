@@ -48,7 +48,7 @@ pub use normaliser::{ObservationNormaliser, RewardNormaliser, RunningMoments};
 pub use normalisers::{Normalisers, Statistics};
 pub use objective::{Acting, Objective, Surrogate};
 pub use optimiser::{Adam, Optimiser, RmsProp, UpdateRule};
-pub use player::{Player, PlayerState, Role, RolloutStep, SlotEnd, StepOutcome, TrialStreams};
+pub use player::{Player, PlayerRole, PlayerTrainingState, RolloutStep, SlotEnd, StepOutcome, TrialStreams};
 pub use recurrent::{
     MakeRecurrent, RecurrentBatch, RecurrentDifferentiator, has_recurrent, recurrent_differentiator, register_recurrent,
 };

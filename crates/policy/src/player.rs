@@ -26,7 +26,7 @@ use crate::spec::PolicySpec;
 pub struct Player {
     actor: Actor,
     inputs: Inputs,
-    role: Role,
+    role: PlayerRole,
     normalisers: Normalisers,
     observation_size: usize,
     episodes_per_trial: u32,
@@ -47,7 +47,7 @@ pub struct Player {
 /// The role of a player in a training or a test: its random numbers, and whether its statistics are updated.
 #[derive(Clone, Debug)]
 #[allow(clippy::large_enum_variant)] // a player has only one role, and reads its stream at every action
-pub enum Role {
+pub enum PlayerRole {
     /// In training, the statistics are updated. One random stream gives all actions and all noise, in the order of the
     /// environments.
     Training(ChaCha8Rng),
@@ -67,7 +67,7 @@ pub struct TrialStreams {
 /// The state of a player between two steps of a training, without weights and normalisers. Together with the weights
 /// and the normalisers, it determines all further actions.
 #[derive(Clone, Debug, PartialEq)]
-pub struct PlayerState {
+pub struct PlayerTrainingState {
     /// `[N, O]` normalised observations from which the next actions are chosen.
     pub observations: Vec<f32>,
     /// `[N]` whether the environment's observation is the first of a trial.
@@ -149,7 +149,7 @@ struct PreviousStep {
     truncated_slots: Vec<usize>,
 }
 
-impl Streams for Role {
+impl Streams for PlayerRole {
     fn stream(&mut self, environment: usize) -> &mut ChaCha8Rng {
         match self {
             Self::Training(stream) => stream,
@@ -158,7 +158,7 @@ impl Streams for Role {
     }
 }
 
-impl Role {
+impl PlayerRole {
     /// Returns the role for a training with `seed`.
     pub fn training(seed: u64) -> Self {
         Self::Training(stream(seed, Purpose::Actions))
@@ -198,7 +198,7 @@ impl Player {
         n_envs: usize,
         episodes_per_trial: u32,
         normalisers: Normalisers,
-        role: Role,
+        role: PlayerRole,
     ) -> Self {
         let observation_size = inputs.observation_size();
         Self {
@@ -307,7 +307,7 @@ impl Player {
     pub fn begin_trial(&mut self, slot: usize, seed: u64, trial_index: u64) {
         self.actor.forget(slot);
         self.inputs.forget(slot);
-        if let Role::Testing(trials) = &mut self.role {
+        if let PlayerRole::Testing(trials) = &mut self.role {
             trials.streams[slot] = trial_stream(seed, Purpose::TestActions, trials.indices[slot], trial_index);
         }
     }
@@ -366,7 +366,7 @@ impl Player {
             let values = previous.truncated_slots.iter().zip(&self.values);
             values.for_each(|(&slot, value)| previous.truncation_values[slot] = *value);
         }
-        let seed = if let Role::Testing(trials) = &self.role { trials.seed } else { 0 };
+        let seed = if let PlayerRole::Testing(trials) = &self.role { trials.seed } else { 0 };
         for end in outcome.ended {
             if self.previous.trial_ended[end.slot] {
                 self.begin_trial(end.slot, seed, end.trial_index + 1);
@@ -378,7 +378,7 @@ impl Player {
     }
 
     fn add_noise(&mut self) {
-        if let (Role::Training(stream), true) = (&mut self.role, self.noise > 0.0) {
+        if let (PlayerRole::Training(stream), true) = (&mut self.role, self.noise > 0.0) {
             self.observations.iter_mut().for_each(|x| *x += (self.noise * normal(stream)) as f32);
         }
     }
@@ -423,7 +423,7 @@ impl Player {
     }
 
     /// Returns the role: the random numbers for actions, and whether statistics are updated.
-    pub fn role(&self) -> &Role {
+    pub fn role(&self) -> &PlayerRole {
         &self.role
     }
 
@@ -433,9 +433,9 @@ impl Player {
     }
 
     /// Returns the player's state between two steps, for [`Player::restore`]. `None` in a test.
-    pub fn state(&self) -> Option<PlayerState> {
-        let Role::Training(actions) = &self.role else { return None };
-        Some(PlayerState {
+    pub fn state(&self) -> Option<PlayerTrainingState> {
+        let PlayerRole::Training(actions) = &self.role else { return None };
+        Some(PlayerTrainingState {
             observations: self.observations.clone(),
             starts: self.starts.clone(),
             previous_steps: self.inputs.previous_steps().to_vec(),
@@ -448,15 +448,15 @@ impl Player {
     ///
     /// # Errors
     /// [`Error::Length`](crate::Error::Length) if an array does not fit.
-    pub fn restore(&mut self, state: &PlayerState) -> Result<()> {
-        let PlayerState { observations, starts, previous_steps, memory, actions } = state;
+    pub fn restore(&mut self, state: &PlayerTrainingState) -> Result<()> {
+        let PlayerTrainingState { observations, starts, previous_steps, memory, actions } = state;
         check_length("observations [N, O]", observations.len(), self.observations.len())?;
         check_length("starts [N]", starts.len(), self.starts.len())?;
         self.inputs.restore(previous_steps)?;
         self.actor.set_memory(memory)?;
         self.observations.copy_from_slice(observations);
         self.starts.copy_from_slice(starts);
-        self.role = Role::Training(actions.clone());
+        self.role = PlayerRole::Training(actions.clone());
         Ok(())
     }
 }

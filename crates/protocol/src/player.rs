@@ -2,7 +2,7 @@
 //! normalisers, random streams and memory.
 
 use bytes::Bytes;
-use perturb_policy::{CollectUntil, ObservationNormaliser, PlayerState, RewardNormaliser, RunningMoments};
+use perturb_policy::{CollectUntil, ObservationNormaliser, PlayerTrainingState, RewardNormaliser, RunningMoments};
 use rand_chacha::ChaCha8Rng;
 use rand_chacha::rand_core::SeedableRng;
 
@@ -128,9 +128,9 @@ impl TryFrom<&proto::RandomStream> for ChaCha8Rng {
     }
 }
 
-impl From<&PlayerState> for proto::PlayerState {
+impl From<&PlayerTrainingState> for proto::PlayerState {
     /// Converts all fields except the random stream of the actions.
-    fn from(state: &PlayerState) -> Self {
+    fn from(state: &PlayerTrainingState) -> Self {
         Self {
             observations: floats(&state.observations),
             starts: state.starts.iter().map(|&start| u8::from(start)).collect(),
@@ -145,12 +145,12 @@ impl From<&PlayerState> for proto::PlayerState {
 ///
 /// # Errors
 /// [`DecodeError`] if an array is malformed or a number is not finite.
-pub fn player_state(state: &proto::PlayerState, actions: ChaCha8Rng) -> Result<PlayerState, DecodeError> {
+pub fn player_state(state: &proto::PlayerState, actions: ChaCha8Rng) -> Result<PlayerTrainingState, DecodeError> {
     if let Some(slot) = state.starts.iter().position(|&flag| flag > 1) {
         let got = format!("{} in slot {slot}", state.starts[slot]);
         return Err(DecodeError::new("starts", got, "0 or 1"));
     }
-    Ok(PlayerState {
+    Ok(PlayerTrainingState {
         observations: read_floats("observations", &state.observations)?,
         starts: state.starts.iter().map(|&flag| flag == 1).collect(),
         previous_steps: read_floats("outcomes", &state.outcomes)?,
@@ -214,7 +214,7 @@ mod tests {
         stream.set_stream(4);
         stream.set_word_pos(1 << 40);
         assert_eq!(ChaCha8Rng::try_from(&proto::RandomStream::from(&stream)), Ok(stream.clone()));
-        let state = PlayerState {
+        let state = PlayerTrainingState {
             observations: vec![1.0, 2.0],
             starts: vec![true, false],
             previous_steps: vec![0.0],

@@ -6,8 +6,8 @@ use perturb_settings::A2cConfig;
 use super::watch::UpdateWatch;
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
-use crate::policy::Policy;
-use crate::rollout::{Estimates, Rollout, Trajectories};
+use crate::policy::TrainablePolicy;
+use crate::rollout::{Estimates, RolloutBuffer, Trajectories};
 
 /// Advantage actor-critic (A2C), the synchronous variant of the algorithm of Mnih et al. (2016), arXiv:1602.01783. It
 /// takes one gradient step per rollout, on all its T·N samples, with
@@ -24,7 +24,7 @@ pub struct A2c {
 
 impl A2c {
     /// Returns the algorithm with a new optimiser for the weights of `policy`. Returns an error for an invalid setting.
-    pub fn new(config: A2cConfig, policy: &Policy) -> Result<Self> {
+    pub fn new(config: A2cConfig, policy: &TrainablePolicy) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
         let optimiser = UpdateRule::rms_prop(config.rms_alpha, config.rms_eps, n_weights);
@@ -38,7 +38,12 @@ impl Algorithm for A2c {
         CollectUntil::Steps(self.config.n_steps)
     }
 
-    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
+    fn update(
+        &mut self,
+        policy: &mut TrainablePolicy,
+        rollout: &RolloutBuffer,
+        progress_remaining: f64,
+    ) -> Result<UpdateStats> {
         self.update_many(policy, &[rollout], progress_remaining)
     }
 
@@ -56,8 +61,8 @@ impl Algorithm for A2c {
 impl BaseAlgorithm for A2c {
     fn update_many(
         &mut self,
-        policy: &mut Policy,
-        rollouts: &[&Rollout],
+        policy: &mut TrainablePolicy,
+        rollouts: &[&RolloutBuffer],
         progress_remaining: f64,
     ) -> Result<UpdateStats> {
         let A2cConfig { gamma, ent_coef, vf_coef, bootstrap_truncation, .. } = self.config;
@@ -78,7 +83,7 @@ impl BaseAlgorithm for A2c {
         for rollout in rollouts {
             check_rollout(rollout, policy, self.config.n_steps)?;
             let estimated = n_step_returns(&rollout.trajectories()?, gamma, bootstrap_truncation);
-            let Policy { weights, gradient, backend, .. } = &mut *policy;
+            let TrainablePolicy { weights, gradient, backend, .. } = &mut *policy;
             let batch = backend.batch(&rollout.sequences(&estimated))?;
             let loss = backend.gradient(weights, &batch, &batch.sequences(), &objective, gradient)?;
             norms += self.optimiser.step(loss.total, gradient, weights, learning_rate)?;

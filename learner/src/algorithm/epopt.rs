@@ -5,8 +5,8 @@ use perturb_settings::{EpoptConfig, Ranking};
 
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats};
 use crate::error::Result;
-use crate::policy::Policy;
-use crate::rollout::{EpisodeSlice, Rollout};
+use crate::policy::TrainablePolicy;
+use crate::rollout::{EpisodeSlice, RolloutBuffer};
 
 /// EPOpt-ε, Rajeswaran et al. (2017), arXiv:1610.01283, which wraps another algorithm.
 ///
@@ -50,8 +50,14 @@ impl Algorithm for Epopt {
         CollectUntil::Episodes(self.config.episodes_per_iteration)
     }
 
-    /// Learns from the worst episodes of `rollout`, which must contain L complete episodes, see [`Rollout::episodes`].
-    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
+    /// Learns from the worst episodes of `rollout`, which must contain L complete episodes, see
+    /// [`RolloutBuffer::episodes`].
+    fn update(
+        &mut self,
+        policy: &mut TrainablePolicy,
+        rollout: &RolloutBuffer,
+        progress_remaining: f64,
+    ) -> Result<UpdateStats> {
         let full = self.iterations < self.config.full_iterations;
         let epsilon = if full { 1.0 } else { self.config.epsilon };
         let episodes = rollout.episodes();
@@ -68,7 +74,8 @@ impl Algorithm for Epopt {
         };
         let parts: Vec<&[EpisodeSlice]> =
             if self.config.update_per_episode { kept.chunks(1).collect() } else { vec![&kept] };
-        let parts = parts.into_iter().map(|episodes| rollout.select(episodes)).collect::<Result<Vec<Rollout>>>()?;
+        let parts =
+            parts.into_iter().map(|episodes| rollout.select(episodes)).collect::<Result<Vec<RolloutBuffer>>>()?;
         let mut stats = self.base.update_many(policy, &parts.iter().collect::<Vec<_>>(), progress_remaining)?;
         stats.selection = Some(selection);
         self.iterations += 1;

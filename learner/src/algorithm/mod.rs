@@ -15,8 +15,8 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
 use crate::error::Result;
-use crate::policy::Policy;
-use crate::rollout::{self, Estimates, Rollout};
+use crate::policy::TrainablePolicy;
+use crate::rollout::{self, Estimates, RolloutBuffer};
 
 /// An algorithm that improves a policy from rollouts.
 pub trait Algorithm: Send {
@@ -26,7 +26,12 @@ pub trait Algorithm: Send {
     /// Improves `policy` from a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at
     /// its end. Returns an error if a loss or gradient is not finite; the policy then has the weights from before that
     /// gradient step.
-    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats>;
+    fn update(
+        &mut self,
+        policy: &mut TrainablePolicy,
+        rollout: &RolloutBuffer,
+        progress_remaining: f64,
+    ) -> Result<UpdateStats>;
 
     /// Returns everything that later updates depend on, except the policy's weights.
     fn state(&self) -> AlgorithmState;
@@ -45,8 +50,8 @@ pub trait BaseAlgorithm: Algorithm {
     /// The errors of [`Algorithm::update`].
     fn update_many(
         &mut self,
-        policy: &mut Policy,
-        rollouts: &[&Rollout],
+        policy: &mut TrainablePolicy,
+        rollouts: &[&RolloutBuffer],
         progress_remaining: f64,
     ) -> Result<UpdateStats>;
 }
@@ -104,7 +109,7 @@ pub struct UpdateStats {
 
 /// Checks that the shape of a rollout fits the algorithm and the policy. A rollout of complete episodes may have any
 /// length.
-fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<()> {
+fn check_rollout(rollout: &RolloutBuffer, policy: &TrainablePolicy, n_steps: usize) -> Result<()> {
     if rollout.lengths().is_none() {
         check_length("the rollout's axis T", rollout.n_steps(), n_steps)?;
     }
@@ -118,7 +123,7 @@ fn check_rollout(rollout: &Rollout, policy: &Policy, n_steps: usize) -> Result<(
 ///
 /// # Errors
 /// An error if a setting is out of its range.
-pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn Algorithm>> {
+pub fn build(settings: &Settings, policy: &TrainablePolicy, seed: u64) -> Result<Box<dyn Algorithm>> {
     let base: Box<dyn BaseAlgorithm> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
         Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
@@ -132,7 +137,7 @@ pub fn build(settings: &Settings, policy: &Policy, seed: u64) -> Result<Box<dyn 
 
 /// Returns the share of the variance of the returns that the rollouts' values explain. `estimates` has the returns of
 /// each rollout. Returns `None` if the returns are constant.
-fn explained_variance(rollouts: &[&Rollout], estimates: &[Estimates]) -> Option<f64> {
+fn explained_variance(rollouts: &[&RolloutBuffer], estimates: &[Estimates]) -> Option<f64> {
     let mut values = Vec::new();
     let mut returns = Vec::new();
     for (rollout, estimates) in rollouts.iter().zip(estimates) {

@@ -8,8 +8,8 @@ use rand_chacha::ChaCha8Rng;
 use super::watch::UpdateWatch;
 use super::{Algorithm, AlgorithmState, BaseAlgorithm, UpdateStats, check_rollout, explained_variance};
 use crate::error::Result;
-use crate::policy::Policy;
-use crate::rollout::{Estimates, Rollout, Trajectories};
+use crate::policy::TrainablePolicy;
+use crate::rollout::{Estimates, RolloutBuffer, Trajectories};
 
 /// Proximal policy optimisation (PPO) with a clipped ratio, Schulman et al. (2017), arXiv:1707.06347. An update makes
 /// `n_epochs` passes over a rollout's T·N samples. Each pass divides them at random into `n_minibatches` minibatches,
@@ -29,7 +29,7 @@ pub struct Ppo {
 impl Ppo {
     /// Returns the algorithm with a new optimiser for the weights of `policy`. `seed` determines how minibatches are
     /// drawn. Returns an error for an invalid setting.
-    pub fn new(config: PpoConfig, policy: &Policy, seed: u64) -> Result<Self> {
+    pub fn new(config: PpoConfig, policy: &TrainablePolicy, seed: u64) -> Result<Self> {
         config.validate()?;
         let n_weights = policy.flat_weights().len();
         let optimiser = Optimiser::new(UpdateRule::adam(config.adam_eps, n_weights), config.max_grad_norm)
@@ -56,7 +56,12 @@ impl Algorithm for Ppo {
         CollectUntil::Steps(self.config.n_steps)
     }
 
-    fn update(&mut self, policy: &mut Policy, rollout: &Rollout, progress_remaining: f64) -> Result<UpdateStats> {
+    fn update(
+        &mut self,
+        policy: &mut TrainablePolicy,
+        rollout: &RolloutBuffer,
+        progress_remaining: f64,
+    ) -> Result<UpdateStats> {
         self.update_many(policy, &[rollout], progress_remaining)
     }
 
@@ -78,8 +83,8 @@ impl Algorithm for Ppo {
 impl BaseAlgorithm for Ppo {
     fn update_many(
         &mut self,
-        policy: &mut Policy,
-        rollouts: &[&Rollout],
+        policy: &mut TrainablePolicy,
+        rollouts: &[&RolloutBuffer],
         progress_remaining: f64,
     ) -> Result<UpdateStats> {
         let PpoConfig { gamma, gae_lambda, n_epochs, n_minibatches, kl_coef, bootstrap_truncation, .. } = self.config;
@@ -113,7 +118,7 @@ impl BaseAlgorithm for Ppo {
                     shuffle(sequences, &mut self.rng); // a single minibatch needs no random order
                 }
                 for minibatch in sequences.chunks_exact(sequences.len() / n_minibatches) {
-                    let Policy { weights, gradient, backend, .. } = &mut *policy;
+                    let TrainablePolicy { weights, gradient, backend, .. } = &mut *policy;
                     let loss = backend.gradient(weights, batch, minibatch, &objective, gradient)?;
                     norms += self.optimiser.step(loss.total, gradient, weights, learning_rate)?;
                     backend.weights_changed();

@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use perturb_checkpoint::Counters;
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Cell, CellFolder, CellState, Failure, FailureId, FolderError, Timing};
+use perturb_experiment::{Cell, CellFolder, CellState, FailureId, FailureRecord, FolderError, Timing};
 use perturb_files::Lock;
 use perturb_files::interrupt::StopFlag;
 use perturb_records::RecordsError;
@@ -291,7 +291,7 @@ impl<'a> RunningCell<'a> {
                 let reason = reason.replace(&format!("{}/", folder.path().display()), "");
                 let commit = perturb_experiment::VERSION.into();
                 let requires_restart = fault == Fault::Training;
-                let failure = Failure { id: cell.id.clone(), reason, commit, requires_restart };
+                let failure = FailureRecord { id: cell.id.clone(), reason, commit, requires_restart };
                 folder.write_failure(&failure)?;
                 Ok(CellEvent::Failed { reason: failure.reason })
             }

@@ -10,8 +10,8 @@ mod tests;
 use std::path::Path;
 
 use bytes::Bytes;
-use perturb_checkpoint::{Array, Arrays, ArraysFile, JSON, RESUME_PREFIX, Result, Resume, damaged, encode};
-use perturb_policy::PlayerState;
+use perturb_checkpoint::{Array, Arrays, ArraysFile, JSON, RESUME_PREFIX, Result, StoredResumeState, damaged, encode};
+use perturb_policy::PlayerTrainingState;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 
@@ -75,7 +75,7 @@ impl ResumeState {
         let history = self.history.clone();
         let document = serde_json::to_value(ResumeDocument { arrays: arrays.clone(), algorithm, actions, history });
         let document = document.map_err(|error| damaged(directory, error.to_string()))?;
-        checkpoint.save(directory, Some(Resume { arrays, document }))
+        checkpoint.save(directory, Some(StoredResumeState { arrays, document }))
     }
 
     /// Reads the checkpoint in the folder `path`, or in its subfolder `checkpoint`, with the state of its training.
@@ -96,7 +96,7 @@ impl ResumeState {
     /// Encodes the large arrays for the separate file.
     fn encode(&self) -> std::result::Result<Vec<u8>, String> {
         let CollectorState { snapshots, player } = &self.collector;
-        let PlayerState { observations, starts, previous_steps, memory, actions: _ } = player;
+        let PlayerTrainingState { observations, starts, previous_steps, memory, actions: _ } = player;
         let num_envs = starts.len();
         let rows = |data: &[f32]| vec![num_envs, data.len() / num_envs.max(1)];
         let mut arrays = vec![
@@ -122,7 +122,7 @@ impl ResumeDocument {
         for array in &mut self.algorithm.optimiser {
             array.data = arrays.f32(&optimiser(&array.name))?.data;
         }
-        let player = PlayerState {
+        let player = PlayerTrainingState {
             observations: arrays.f32("observations")?.data,
             starts: arrays.u8("starts")?.iter().map(|&start| start != 0).collect(),
             previous_steps: arrays.f32("outcomes")?.data,

@@ -28,7 +28,7 @@ fn resume_state(seed: u64) -> ResumeState {
     ResumeState {
         collector: CollectorState {
             snapshots: vec![Bytes::from_static(b"\0one"), Bytes::from(vec![255; seed as usize])],
-            player: PlayerState {
+            player: PlayerTrainingState {
                 observations: vec![0.1, f32::MIN_POSITIVE, -3.0, 1e-7, 10.0, seed as f32],
                 starts: vec![true, false],
                 previous_steps: vec![0.5; 6],

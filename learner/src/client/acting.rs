@@ -3,11 +3,11 @@
 use std::io::ErrorKind;
 use std::ops::Range;
 
-use perturb_policy::{Normalisers, Player, PlayerState, PolicySpec, Role};
+use perturb_policy::{Normalisers, Player, PlayerRole, PlayerTrainingState, PolicySpec};
 use perturb_protocol::player::{DecodeError, doubles, observation_normaliser, player_state};
 use perturb_protocol::{ClientError, EndedEpisode};
 
-use super::session::Session;
+use super::session::ClientSession;
 use super::shard::ServerShard;
 use crate::proto;
 
@@ -21,7 +21,7 @@ pub struct RolloutReply {
     pub ended: Vec<(usize, EndedEpisode)>,
 }
 
-impl Session<'_> {
+impl ClientSession<'_> {
     /// Lets all servers of the session play at the same time. `request` returns the request for a server's range of
     /// slots, or `None` to skip this server. `take` receives the range and the server's reply. An error of `take` says
     /// what is wrong with the reply.
@@ -43,8 +43,8 @@ impl Session<'_> {
         )
     }
 
-    /// Asks the only server of the session to play, and returns without waiting for the reply. [`Session::played`]
-    /// receives the reply. Must be called only if [`Session::plays_together`] is true.
+    /// Asks the only server of the session to play, and returns without waiting for the reply.
+    /// [`ClientSession::played`] receives the reply. Must be called only if [`ClientSession::plays_together`] is true.
     ///
     /// # Errors
     /// Connection failures, and [`ClientError::System`] if the session has several servers.
@@ -59,10 +59,10 @@ impl Session<'_> {
         })
     }
 
-    /// Receives the reply to [`Session::ask_to_play`].
+    /// Receives the reply to [`ClientSession::ask_to_play`].
     ///
     /// # Errors
-    /// The errors of [`Session::play`].
+    /// The errors of [`ClientSession::play`].
     pub async fn played(&mut self) -> Result<RolloutReply, ClientError> {
         let Self { servers, parts, .. } = self;
         let [part] = parts.as_mut_slice() else { return Err(not_played_together()) };
@@ -70,7 +70,7 @@ impl Session<'_> {
         part.played(acted)
     }
 
-    /// Returns the error for a malformed reply that [`Session::played`] received. `got` says what is wrong.
+    /// Returns the error for a malformed reply that [`ClientSession::played`] received. `got` says what is wrong.
     pub fn malformed_rollout(&self, got: String) -> ClientError {
         self.parts.first().map_or_else(not_played_together, |part| part.malformed_rollout(got))
     }
@@ -79,8 +79,8 @@ impl Session<'_> {
     /// servers.
     ///
     /// # Errors
-    /// The errors of [`Session::play`].
-    pub fn save_player(&mut self) -> Result<Option<(PlayerState, Normalisers)>, ClientError> {
+    /// The errors of [`ClientSession::play`].
+    pub fn save_player(&mut self) -> Result<Option<(PlayerTrainingState, Normalisers)>, ClientError> {
         let size = self.observation_size();
         let mut states = Vec::new();
         self.exchange(
@@ -138,8 +138,8 @@ pub fn policy(spec: &PolicySpec, player: &Player) -> proto::Policy {
         observations: observations.as_ref().map(|it| it.moments().into()),
         rewards: rewards.as_ref().map(Into::into),
         role: Some(match player.role() {
-            Role::Training(stream) => proto::policy::Role::Training(stream.into()),
-            Role::Testing(trials) => proto::policy::Role::Testing(proto::TestStreams { seed: trials.seed() }),
+            PlayerRole::Training(stream) => proto::policy::Role::Training(stream.into()),
+            PlayerRole::Testing(trials) => proto::policy::Role::Testing(proto::TestStreams { seed: trials.seed() }),
         }),
         state: player.state().as_ref().map(Into::into),
     }
@@ -156,7 +156,10 @@ pub fn for_server(policy: &proto::Policy, n_envs: usize) -> proto::Policy {
 
 /// Parses the state of a server's player. `observation_size` is the session's O. If the normaliser has fewer than O
 /// entries, the last entries of observations are not normalised. The error names the invalid field.
-fn saved_player(saved: &proto::PlayerSaved, observation_size: usize) -> Result<(PlayerState, Normalisers), String> {
+fn saved_player(
+    saved: &proto::PlayerSaved,
+    observation_size: usize,
+) -> Result<(PlayerTrainingState, Normalisers), String> {
     let (Some(actions), Some(state)) = (&saved.actions, &saved.state) else {
         return Err("state or stream of actions is missing".into());
     };

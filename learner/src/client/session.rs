@@ -22,7 +22,7 @@ const MAX_IN_FLIGHT: u32 = 1;
 /// any number of servers and with any other environments in the batch. If a TCP connection is lost but its server still
 /// runs, the server's part of the session is [resumed](perturb_protocol::Stream).
 #[derive(Debug)]
-pub struct Session<'a> {
+pub struct ClientSession<'a> {
     pub(super) servers: &'a Servers,
     pub(super) parts: Vec<ServerShard>,
     environment: proto::Environment,
@@ -31,7 +31,7 @@ pub struct Session<'a> {
     acts: bool,
 }
 
-impl<'a> Session<'a> {
+impl<'a> ClientSession<'a> {
     /// Opens environments on all servers, and writes their first observations `[N, O]` to `observations`.
     ///
     /// # Errors
@@ -45,7 +45,7 @@ impl<'a> Session<'a> {
     /// same environment and the same kind of observation.
     ///
     /// # Errors
-    /// The errors of [`Session::open`].
+    /// The errors of [`ClientSession::open`].
     pub fn open_together(
         servers: &'a Servers,
         options: &[OpenOptions],
@@ -100,7 +100,7 @@ impl<'a> Session<'a> {
     }
 
     /// Returns whether the servers choose the actions: the configuration asks for it, and all servers support it. See
-    /// [`Session::play`].
+    /// [`ClientSession::play`].
     pub fn acts(&self) -> bool {
         self.acts
     }
@@ -309,7 +309,7 @@ impl<'a> Session<'a> {
     }
 }
 
-impl Drop for Session<'_> {
+impl Drop for ClientSession<'_> {
     fn drop(&mut self) {
         self.close(|_| true);
     }

@@ -11,7 +11,7 @@ use super::error::TestError;
 use super::test::{retry_on_disconnect, with_disturbances};
 use super::trials::Trials;
 use crate::checkpoint::Checkpoint;
-use crate::client::{OpenOptions, Servers, Session};
+use crate::client::{ClientSession, OpenOptions, Servers};
 
 /// The result of replaying recorded episodes.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
@@ -110,9 +110,9 @@ fn replay(
 
 /// Chooses at most `max_episodes` of `episodes`, evenly spread over all of them.
 ///
-/// Divides `episodes` into nearly equal parts and takes one episode from each part: the first episode of the first part,
-/// the second episode of the second part, and so on. After the last position in a part, the next part begins with the
-/// first position again. The episodes of an environment are adjacent. Taking the first episode of every part could
+/// Divides `episodes` into nearly equal parts and takes one episode from each part: the first episode of the first
+/// part, the second episode of the second part, and so on. After the last position in a part, the next part begins with
+/// the first position again. The episodes of an environment are adjacent. Taking the first episode of every part could
 /// therefore choose only the early episodes of each environment.
 fn spread(episodes: &[EpisodeRecord], max_episodes: usize) -> impl Iterator<Item = &EpisodeRecord> {
     let count = max_episodes.min(episodes.len());
@@ -151,7 +151,7 @@ impl<'a> Replay<'a> {
             observe: checkpoint.state.config.common.observe,
         };
         let mut observations = Vec::new();
-        let session = Session::open(servers, &options, &mut observations)?;
+        let session = ClientSession::open(servers, &options, &mut observations)?;
         checkpoint.state.check_unchanged(session.environment()).map_err(TestError::from)?;
         let player = checkpoint.player(num_envs, 0, 0)?;
         Ok(Self {

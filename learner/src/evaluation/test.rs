@@ -12,7 +12,7 @@ use perturb_settings::{TrainConfig, ValueError, sets};
 use super::error::TestError;
 use super::trials::{RemoteTrials, Trials};
 use crate::checkpoint::Checkpoint;
-use crate::client::{Backoff, EndedEpisode, OpenOptions, Reconnect, Servers, Session};
+use crate::client::{Backoff, ClientSession, EndedEpisode, OpenOptions, Reconnect, Servers};
 
 /// Options of a test.
 #[derive(Clone, Debug, PartialEq)]
@@ -158,7 +158,7 @@ impl<'a> Tester<'a> {
             observe: self.checkpoint.state.config.common.observe,
         };
         let mut observations = Vec::new();
-        let mut session = Session::open(self.servers, &options, &mut observations)?;
+        let mut session = ClientSession::open(self.servers, &options, &mut observations)?;
         let size = session.observation_size();
         for slot in 0..num_envs {
             let context: Vec<(&str, f64)> =

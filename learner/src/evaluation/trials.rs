@@ -8,7 +8,7 @@ use perturb_protocol::player::floats;
 
 use super::error::TestError;
 use crate::checkpoint::Checkpoint;
-use crate::client::{EndedEpisode, RolloutReply, Session, StepReply, acting};
+use crate::client::{ClientSession, EndedEpisode, RolloutReply, StepReply, acting};
 use crate::proto;
 
 /// Number of steps of each environment that a request asks a server to play. It is small compared with a whole test,
@@ -17,7 +17,7 @@ const STEPS_PER_REQUEST: u32 = 64;
 
 /// Plays trials with actions that this process chooses.
 pub(super) struct Trials<'a> {
-    pub(super) session: Session<'a>,
+    pub(super) session: ClientSession<'a>,
     pub(super) player: Player,
     reply: StepReply,
     ended: Vec<SlotEnd>,
@@ -25,7 +25,7 @@ pub(super) struct Trials<'a> {
 
 /// Plays trials with actions that the servers choose.
 pub(super) struct RemoteTrials<'a> {
-    session: Session<'a>,
+    session: ClientSession<'a>,
     /// The `policy` message and the weights for the first request to the servers; `None` after this request.
     policy: Option<(proto::Policy, bytes::Bytes)>,
     episodes_per_trial: u32,
@@ -34,7 +34,7 @@ pub(super) struct RemoteTrials<'a> {
 impl<'a> Trials<'a> {
     /// Starts trials of `player` in the environments of `session`. `observations` `[N, O]` are the environments' first
     /// observations.
-    pub(super) fn begin(session: Session<'a>, mut player: Player, observations: &[f32]) -> PolicyResult<Self> {
+    pub(super) fn begin(session: ClientSession<'a>, mut player: Player, observations: &[f32]) -> PolicyResult<Self> {
         player.begin(observations, None)?;
         Ok(Self { session, player, reply: StepReply::default(), ended: Vec::new() })
     }
@@ -51,7 +51,7 @@ impl<'a> Trials<'a> {
 
 impl<'a> RemoteTrials<'a> {
     /// Prepares trials in the environments of `session`. `player` must have the policy of `checkpoint`.
-    pub(super) fn new(session: Session<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
+    pub(super) fn new(session: ClientSession<'a>, player: &Player, checkpoint: &Checkpoint) -> Self {
         let policy = (acting::policy(&checkpoint.policy, player), floats(&checkpoint.flat_weights()));
         Self { session, policy: Some(policy), episodes_per_trial: player.episodes_per_trial() }
     }

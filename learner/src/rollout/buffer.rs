@@ -23,7 +23,7 @@ pub struct EpisodeSlice {
 /// A rollout of complete episodes (for EPOpt) has no fixed T: it grows until it is finished, and also lists its
 /// episodes.
 #[derive(Clone, Debug)]
-pub struct Rollout {
+pub struct RolloutBuffer {
     /// T, or `None` for a rollout of complete episodes, whose length is not fixed.
     fixed_steps: Option<usize>,
     n_envs: usize,
@@ -46,14 +46,14 @@ pub struct Rollout {
     lengths: Option<Vec<usize>>,
 }
 
-impl Rollout {
+impl RolloutBuffer {
     /// Returns an empty rollout for T = `n_steps`, N = `n_envs`, O = `observation_size` and A = `action_width` (see
     /// [`ActionKind::width`](perturb_policy::ActionKind::width)). Allocates all memory in advance.
     pub fn new(n_steps: usize, n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_capacity(Some(n_steps), n_steps, n_envs, observation_size, action_width)
     }
 
-    /// Returns an empty rollout for complete episodes. It grows with every step until [`Rollout::finish`].
+    /// Returns an empty rollout for complete episodes. It grows with every step until [`RolloutBuffer::finish`].
     pub fn of_episodes(n_envs: usize, observation_size: usize, action_width: usize) -> Self {
         Self::with_capacity(None, 0, n_envs, observation_size, action_width)
     }
@@ -67,7 +67,7 @@ impl Rollout {
         action_width: usize,
     ) -> Self {
         let size = capacity * n_envs;
-        Rollout {
+        RolloutBuffer {
             fixed_steps,
             n_envs,
             observation_size,
@@ -148,7 +148,7 @@ impl Rollout {
     }
 
     /// Finishes the rollout. `last_values` `[N]` are V(s_T), the values of the observations after the last step. Must
-    /// be called after the last [`Rollout::push`] and before an update.
+    /// be called after the last [`RolloutBuffer::push`] and before an update.
     pub fn finish(&mut self, last_values: &[f32]) -> Result<()> {
         if !self.is_full() && self.fixed_steps.is_some() {
             return Err(Error::RolloutLength { got: self.len, expected: self.n_steps(), what: "it was finished" });
@@ -163,7 +163,7 @@ impl Rollout {
     /// Returns the arrays from which advantages are estimated.
     ///
     /// # Errors
-    /// [`Error::RolloutLength`] before [`Rollout::finish`].
+    /// [`Error::RolloutLength`] before [`RolloutBuffer::finish`].
     pub fn trajectories(&self) -> Result<Trajectories<'_>> {
         if !self.finished {
             let what = "it was used before it was finished";
@@ -243,7 +243,7 @@ impl Rollout {
         &self.episodes
     }
 
-    /// Returns the sum of stored rewards of each complete episode, in the order of [`Rollout::episodes`]. Stored
+    /// Returns the sum of stored rewards of each complete episode, in the order of [`RolloutBuffer::episodes`]. Stored
     /// rewards are normalised if reward normalisation is on.
     pub fn normalized_returns(&self) -> Vec<f64> {
         let reward = |step: usize, environment: usize| f64::from(self.rewards[step * self.n_envs + environment]);
@@ -259,7 +259,7 @@ impl Rollout {
     ///
     /// # Errors
     /// An error if `episodes` is empty, or one of them is not in this rollout.
-    pub fn select(&self, episodes: &[EpisodeSlice]) -> Result<Rollout> {
+    pub fn select(&self, episodes: &[EpisodeSlice]) -> Result<RolloutBuffer> {
         let longest = episodes.iter().map(|episode| episode.length).max().unwrap_or(0);
         if longest == 0 {
             return Err(Error::RolloutLength { got: 0, expected: 1, what: "its episodes were selected" });
@@ -298,10 +298,10 @@ impl Rollout {
     }
 
     /// Returns a finished rollout that has only padding.
-    fn padding(&self, n_steps: usize, n_envs: usize) -> Rollout {
+    fn padding(&self, n_steps: usize, n_envs: usize) -> RolloutBuffer {
         let size = n_steps * n_envs;
         let memory_size = self.memory.len() / self.n_envs;
-        Rollout {
+        RolloutBuffer {
             len: n_steps,
             finished: true,
             observations: vec![0.0; size * self.observation_size],
@@ -315,7 +315,7 @@ impl Rollout {
             truncation_values: vec![0.0; size],
             last_values: vec![0.0; n_envs],
             memory: vec![0.0; n_envs * memory_size],
-            ..Rollout::with_capacity(Some(n_steps), 0, n_envs, self.observation_size, self.action_width)
+            ..RolloutBuffer::with_capacity(Some(n_steps), 0, n_envs, self.observation_size, self.action_width)
         }
     }
 
@@ -357,7 +357,7 @@ impl Rollout {
         &self.starts
     }
 
-    /// Returns the policy's recurrent memory before the first step, `[N, S]`, as given to [`Rollout::begin`].
+    /// Returns the policy's recurrent memory before the first step, `[N, S]`, as given to [`RolloutBuffer::begin`].
     pub fn memory(&self) -> &[f32] {
         &self.memory
     }

@@ -2,9 +2,9 @@
 
 use bytes::Bytes;
 
-use super::Rollout;
-use crate::client::{ClientError, EndedEpisode, Session, StepReply, StepSlice};
-use perturb_policy::{CollectUntil, Player, PlayerState, RemainingRollout, SlotEnd};
+use super::RolloutBuffer;
+use crate::client::{ClientError, ClientSession, EndedEpisode, StepReply, StepSlice};
+use perturb_policy::{CollectUntil, Player, PlayerTrainingState, RemainingRollout, SlotEnd};
 
 /// The reason why a rollout could not be collected.
 #[derive(Debug, thiserror::Error)]
@@ -53,7 +53,7 @@ pub struct CollectorState {
     /// Snapshots of the N environments.
     pub snapshots: Vec<Bytes>,
     /// The player's state.
-    pub player: PlayerState,
+    pub player: PlayerTrainingState,
 }
 
 impl Collector {
@@ -80,7 +80,7 @@ impl Collector {
     pub fn begin(
         &mut self,
         until: CollectUntil,
-        rollout: &mut Rollout,
+        rollout: &mut RolloutBuffer,
         reset: impl FnOnce(&mut [f32]) -> Result<(), ClientError>,
     ) -> Result<(), CollectError> {
         self.remaining = until.begin(self.player.n_envs());
@@ -114,7 +114,7 @@ impl Collector {
     pub fn take(
         &mut self,
         reply: &StepSlice<'_>,
-        rollout: &mut Rollout,
+        rollout: &mut RolloutBuffer,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         let Self { player, remaining, ended } = self;
@@ -135,7 +135,7 @@ impl Collector {
     ///
     /// # Errors
     /// [`CollectError::Numbers`] if a value is not finite.
-    pub fn finish(&mut self, rollout: &mut Rollout) -> Result<(), CollectError> {
+    pub fn finish(&mut self, rollout: &mut RolloutBuffer) -> Result<(), CollectError> {
         Ok(rollout.finish(self.player.last_values(&self.remaining)?)?)
     }
 
@@ -145,10 +145,10 @@ impl Collector {
     /// [`CollectError`] if the session fails or a number is not finite; the steps of this rollout are then lost.
     pub fn collect(
         &mut self,
-        session: &mut Session<'_>,
+        session: &mut ClientSession<'_>,
         weights: &[f32],
         until: CollectUntil,
-        rollout: &mut Rollout,
+        rollout: &mut RolloutBuffer,
         mut on_episode: impl FnMut(&EndedEpisode),
     ) -> Result<(), CollectError> {
         let mut reply = StepReply::default();

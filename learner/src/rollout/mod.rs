@@ -6,7 +6,7 @@ mod collector;
 mod decoded;
 
 pub use advantage::{Estimates, EstimatorStep, Trajectories, explained_variance};
-pub use buffer::{EpisodeSlice, Rollout};
+pub use buffer::{EpisodeSlice, RolloutBuffer};
 pub use collector::{CollectError, Collector, CollectorState};
 pub use decoded::DecodedRollout;
 pub use perturb_policy::{Normalisers, RolloutStep};

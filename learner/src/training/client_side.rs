@@ -8,17 +8,17 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use perturb_policy::{Normalisers, Player, PlayerState};
+use perturb_policy::{Normalisers, Player, PlayerTrainingState};
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;
 use super::{CollectRollouts, Collected, Result, Run, TrainOutcome, TrainRequest};
-use crate::client::{OpenOptions, Servers, Session, StepReply};
+use crate::client::{ClientSession, OpenOptions, Servers, StepReply};
 use crate::rollout::Collector;
 
 /// Collects the rollouts of runs that share a session: every step is one request for the environments of all runs.
 pub(super) struct ClientSide<'a> {
-    session: Session<'a>,
+    session: ClientSession<'a>,
     /// The state of each run, in the order of slots.
     lanes: Vec<ClientLane>,
     /// Whether runs act and are updated in reverse order. The order alternates at every update, so that the run that
@@ -61,7 +61,7 @@ impl<'a> ClientSide<'a> {
     ) -> Result<(Self, Vec<Run<'d>>)> {
         let options: Vec<OpenOptions> = entries.iter().map(|(_, entry)| options(entry.start.config())).collect();
         let mut observations = Vec::new();
-        let mut session = Session::open_together(servers, &options, &mut observations)?;
+        let mut session = ClientSession::open_together(servers, &options, &mut observations)?;
         let size = session.observation_size();
         let mut lanes = Vec::new();
         let mut runs = Vec::new();
@@ -156,7 +156,7 @@ impl CollectRollouts for ClientSide<'_> {
         self.lane(index).map(|lane| lane.collector.player_mut())
     }
 
-    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>> {
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerTrainingState, Normalisers)>> {
         let player = self.lane(index).map(|lane| lane.collector.player());
         Ok(player.and_then(|player| Some((player.state()?, player.normalisers().clone()))))
     }
@@ -179,7 +179,7 @@ impl CollectRollouts for ClientSide<'_> {
 
 impl ClientLane {
     /// Chooses the next actions. Starts a rollout first if none is in progress.
-    fn act(&mut self, session: &mut Session<'_>, trainer: &mut Trainer<'_>, now: StepTimes) -> Result<()> {
+    fn act(&mut self, session: &mut ClientSession<'_>, trainer: &mut Trainer<'_>, now: StepTimes) -> Result<()> {
         if self.begun.is_none() {
             self.begun = Some(now);
             let until = trainer.collect_until();

@@ -29,7 +29,7 @@ pub use ending::is_over;
 pub use entry::{Start, TrainOutcome, TrainRequest};
 pub use error::{LastCheckpoint, TrainError};
 use perturb_files::interrupt::StopFlag;
-use perturb_policy::{Normalisers, Player, PlayerState};
+use perturb_policy::{Normalisers, Player, PlayerTrainingState};
 use perturb_settings::TrainConfig;
 pub use run_directory::{RunDirectory, RunDirectoryError, mark_in};
 use server_side::ServerSide;
@@ -213,7 +213,7 @@ trait CollectRollouts {
     ///
     /// # Errors
     /// Connection failures.
-    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>>;
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerTrainingState, Normalisers)>>;
 
     /// Returns snapshots of a run's environments between two rollouts.
     ///

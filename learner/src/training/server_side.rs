@@ -10,14 +10,14 @@ use std::time::{Duration, Instant};
 use bytes::Bytes;
 use futures_util::StreamExt;
 use futures_util::stream::FuturesUnordered;
-use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerTrainingState, PolicySpec};
 use perturb_protocol::player::{floats, read_floats};
 use perturb_settings::CollectionMode;
 
 use super::start::{options, start_or_resume};
 use super::trainer::Trainer;
 use super::{CollectRollouts, Collected, Result, Run, TrainOutcome, TrainRequest};
-use crate::client::{ClientError, RolloutReply, Servers, Session, acting};
+use crate::client::{ClientError, ClientSession, RolloutReply, Servers, acting};
 use crate::proto;
 use crate::rollout::{CollectError, DecodedRollout};
 
@@ -45,7 +45,7 @@ pub(super) struct ServerSide<'a> {
 struct ServerLane<'a> {
     /// The index of the run.
     index: usize,
-    session: Session<'a>,
+    session: ClientSession<'a>,
     spec: PolicySpec,
     /// The initial player, until the first request has sent its state to the server.
     player: Option<Player>,
@@ -87,7 +87,7 @@ impl<'a> ServerSide<'a> {
                 continue;
             }
             let mut observations = Vec::new();
-            let mut session = Session::open(servers, &options(config), &mut observations)?;
+            let mut session = ClientSession::open(servers, &options(config), &mut observations)?;
             // A server chooses actions only if it has all environments of the training.
             if !session.plays_together() {
                 others.push((index, entry));
@@ -155,7 +155,7 @@ impl CollectRollouts for ServerSide<'_> {
         None
     }
 
-    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerState, Normalisers)>> {
+    fn player_state(&mut self, index: usize) -> Result<Option<(PlayerTrainingState, Normalisers)>> {
         let Some(lane) = self.lane(index).filter(|lane| lane.player.is_none()) else { return Ok(None) };
         Ok(lane.session.save_player()?)
     }

@@ -5,7 +5,7 @@ use std::ops::Range;
 
 use perturb_checkpoint::Counters;
 use perturb_files::write_atomically;
-use perturb_policy::{CollectUntil, Normalisers, Player, RewardNormaliser, Role};
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerRole, RewardNormaliser};
 use perturb_records::ParameterComparison;
 use perturb_settings::{Base, Common, Settings, TrainConfig, Wrapper};
 
@@ -13,10 +13,10 @@ use super::ending::RECENT;
 use super::trainer::{EpisodeTally, Trainer};
 use super::{Result, RunDirectory, Start, TrainError, TrainRequest};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, ResumeState, State};
-use crate::client::{OpenOptions, Session};
+use crate::client::{ClientSession, OpenOptions};
 use crate::logging::{Clock, Logs, TimeShares};
-use crate::policy::Policy;
-use crate::rollout::Rollout;
+use crate::policy::TrainablePolicy;
+use crate::rollout::RolloutBuffer;
 use crate::{algorithm, proto};
 
 /// Returns the options of the environments that `config` trains in.
@@ -37,7 +37,7 @@ pub(super) fn options(config: &TrainConfig) -> OpenOptions {
 /// `[N, O]` are the first observations of these environments.
 pub(super) fn start_or_resume<'a>(
     entry: TrainRequest<'a>,
-    session: &mut Session<'_>,
+    session: &mut ClientSession<'_>,
     slots: Range<usize>,
     observations: &[f32],
     threads: usize,
@@ -81,7 +81,7 @@ fn begin<'a>(
         commits: Vec::new(),
     };
     let spec = state.policy();
-    let policy = Policy::new(spec.clone(), common.seed)?.with_threads(threads)?;
+    let policy = TrainablePolicy::new(spec.clone(), common.seed)?.with_threads(threads)?;
     let normalisers = Normalisers {
         observations: state.fresh_normaliser(),
         rewards: common.normalize_rewards.then(|| {
@@ -118,7 +118,8 @@ fn resume<'a>(
         let environment = state.config.common.environment.clone();
         return Err(TrainError::Changed { environment, what, trained, served });
     }
-    let policy = Policy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?.with_threads(threads)?;
+    let policy =
+        TrainablePolicy::from_weights(checkpoint.policy.clone(), &checkpoint.weights)?.with_threads(threads)?;
     let normalisers =
         Normalisers { observations: state.observation_normaliser.clone(), rewards: state.reward_normaliser.clone() };
     let mut player = player(state, normalisers);
@@ -143,7 +144,7 @@ fn resume<'a>(
 /// Returns a trainer with a new algorithm state and no episodes.
 fn new_trainer<'a>(
     directory: &'a RunDirectory,
-    policy: Policy,
+    policy: TrainablePolicy,
     environment: &proto::Environment,
     mut checkpoint: Checkpoint,
     logs: Logs,
@@ -159,8 +160,8 @@ fn new_trainer<'a>(
     let input_size = spec.observation_size;
     let width = spec.action.width();
     let rollout = match algorithm.collect_until() {
-        CollectUntil::Steps(n_steps) => Rollout::new(n_steps, n_envs, input_size, width),
-        CollectUntil::Episodes(_) => Rollout::of_episodes(n_envs, input_size, width),
+        CollectUntil::Steps(n_steps) => RolloutBuffer::new(n_steps, n_envs, input_size, width),
+        CollectUntil::Episodes(_) => RolloutBuffer::of_episodes(n_envs, input_size, width),
     };
     Ok(Trainer {
         directory,
@@ -193,7 +194,7 @@ fn player(state: &State, normalisers: Normalisers) -> Player {
     let spec = state.policy();
     let inputs = state.inputs(num_envs);
     let episodes_per_trial = state.config.settings.episodes_per_trial();
-    let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, Role::training(seed));
+    let player = Player::new(&spec, inputs, num_envs, episodes_per_trial, normalisers, PlayerRole::training(seed));
     let player = player.with_noise(observation_noise);
     match &state.config.settings {
         // A2C makes one gradient step per rollout. It can use the activations that acting has already computed.

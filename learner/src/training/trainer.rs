@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use perturb_checkpoint::Counters;
 use perturb_files::interrupt::StopFlag;
-use perturb_policy::{CollectUntil, Normalisers, Player, PlayerState, PolicySpec};
+use perturb_policy::{CollectUntil, Normalisers, Player, PlayerTrainingState, PolicySpec};
 use perturb_records::ParameterComparison;
 use perturb_settings::{Common, EpoptConfig, TrainConfig, Wrapper};
 
@@ -17,15 +17,15 @@ use crate::checkpoint::{Checkpoint, History, ResumeState, State};
 use crate::client::EndedEpisode;
 use crate::error::Error;
 use crate::logging::{Clock, EpisodeFigures, Logs, Progress, TimeShares};
-use crate::policy::{GradientWorkspace, Policy};
-use crate::rollout::{CollectorState, Rollout};
+use crate::policy::{GradientWorkspace, TrainablePolicy};
+use crate::rollout::{CollectorState, RolloutBuffer};
 
 /// Holds the policy, algorithm, rollout, logs and checkpoint of a run.
 pub(super) struct Trainer<'a> {
     pub(super) directory: &'a RunDirectory,
-    pub(super) policy: Policy,
+    pub(super) policy: TrainablePolicy,
     pub(super) algorithm: Box<dyn Algorithm>,
-    pub(super) rollout: Rollout,
+    pub(super) rollout: RolloutBuffer,
     pub(super) tally: EpisodeTally,
     pub(super) logs: Logs,
     /// The checkpoint after the last complete iteration. Its weights and normalisers are updated only when it is saved.
@@ -81,7 +81,7 @@ impl Trainer<'_> {
     }
 
     /// Returns the buffers for a rollout and its episodes.
-    pub(super) fn collecting(&mut self) -> (&mut Rollout, &mut EpisodeTally) {
+    pub(super) fn collecting(&mut self) -> (&mut RolloutBuffer, &mut EpisodeTally) {
         (&mut self.rollout, &mut self.tally)
     }
 
@@ -95,7 +95,7 @@ impl Trainer<'_> {
         self.last_update.unwrap_or(LONG_UPDATE)
     }
 
-    /// Returns a workspace for [`Trainer::update`], see [`Policy::workspace`].
+    /// Returns a workspace for [`Trainer::update`], see [`TrainablePolicy::workspace`].
     pub(super) fn workspace(&self) -> Result<Option<GradientWorkspace>> {
         Ok(self.policy.workspace()?)
     }
@@ -244,7 +244,7 @@ impl Trainer<'_> {
     pub(super) fn save(
         &mut self,
         snapshots: Vec<bytes::Bytes>,
-        player: PlayerState,
+        player: PlayerTrainingState,
         normalisers: Normalisers,
     ) -> Result<()> {
         self.copy_policy(normalisers);

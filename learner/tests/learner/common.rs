@@ -2,8 +2,8 @@
 
 use perturb_learner::algorithm::{A2c, BaseAlgorithm, Ppo};
 use perturb_learner::client::{Address, OpenOptions, PrivateServer, Servers};
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::Rollout;
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::RolloutBuffer;
 use perturb_policy::PolicySpec;
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_protocol::Version;
@@ -35,16 +35,16 @@ pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> O
 }
 
 /// Returns a policy in which every number, including biases and log_std, differs from its initial value by about 0.1.
-pub fn moved(spec: &PolicySpec) -> Policy {
+pub fn moved(spec: &PolicySpec) -> TrainablePolicy {
     perturb_torch::register();
     let mut rng = stream(9, Purpose::Weights);
-    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    let mut weights = TrainablePolicy::new(spec.clone(), 1).expect("a policy").weights();
     weights.iter_mut().flat_map(|array| &mut array.data).for_each(|x| *x += 0.1 * normal(&mut rng) as f32);
-    Policy::from_weights(spec.clone(), &weights).expect("a policy")
+    TrainablePolicy::from_weights(spec.clone(), &weights).expect("a policy")
 }
 
 /// Returns A2C and PPO with these settings.
-pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn BaseAlgorithm>; 2] {
+pub fn bases(n_steps: usize, n_minibatches: usize, policy: &TrainablePolicy) -> [Box<dyn BaseAlgorithm>; 2] {
     let a2c = A2cConfig { n_steps, learning_rate: 7e-3, ..A2cConfig::default() };
     let ppo =
         PpoConfig { n_steps, n_minibatches, n_epochs: 3, learning_rate: 3e-3, kl_coef: 0.1, ..Default::default() };
@@ -55,7 +55,7 @@ pub fn bases(n_steps: usize, n_minibatches: usize, policy: &Policy) -> [Box<dyn 
 }
 
 /// Returns all arrays of a finished rollout, with flags as 0 and 1.
-pub fn contents(rollout: &Rollout) -> Vec<Vec<f32>> {
+pub fn contents(rollout: &RolloutBuffer) -> Vec<Vec<f32>> {
     let flags = |flags: &[bool]| flags.iter().map(|&flag| f32::from(u8::from(flag))).collect::<Vec<_>>();
     let trajectories = rollout.trajectories().expect("a finished rollout");
     vec![

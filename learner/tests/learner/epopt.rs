@@ -6,14 +6,16 @@ use std::collections::{BTreeMap, HashSet};
 use perturb_learner::algorithm::{
     A2c, Algorithm, AlgorithmState, BaseAlgorithm, EpisodeSelection, Epopt, Ppo, UpdateStats, gae, n_step_returns,
 };
-use perturb_learner::client::{EndedEpisode, PrivateServer, Session};
+use perturb_learner::client::{ClientSession, EndedEpisode, PrivateServer};
 use perturb_learner::error::Error;
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Collector, EpisodeSlice, Estimates, Normalisers, Rollout, RolloutStep, Trajectories};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{
+    Collector, EpisodeSlice, Estimates, Normalisers, RolloutBuffer, RolloutStep, Trajectories,
+};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
-    ActionKind, Actor, ActorOutput, CollectUntil, Inputs, ObservationNormaliser, Player, PolicySpec, RewardNormaliser,
-    Role,
+    ActionKind, Actor, ActorOutput, CollectUntil, Inputs, ObservationNormaliser, Player, PlayerRole, PolicySpec,
+    RewardNormaliser,
 };
 use perturb_settings::{A2cConfig, EpoptConfig, PpoConfig, Ranking};
 use perturb_torch::{Sequences, TorchPolicy};
@@ -40,7 +42,12 @@ fn noise(count: usize, rng: &mut ChaCha8Rng) -> Vec<f32> {
 /// Fills `rollout` with episodes of random numbers. Successive episodes of environment n have the lengths `lengths[n]`
 /// and the returns `returns[n]`. An environment that has played all its episodes is stepped further, outside of any
 /// episode, until the others have ended. The task ends about half of the episodes, and the step limit ends the others.
-fn play(policy: &Policy, lengths: &[Vec<usize>], returns: &[Vec<f64>], mut rollout: Rollout) -> Rollout {
+fn play(
+    policy: &TrainablePolicy,
+    lengths: &[Vec<usize>],
+    returns: &[Vec<f64>],
+    mut rollout: RolloutBuffer,
+) -> RolloutBuffer {
     let action = policy.spec().action;
     let n_envs = lengths.len();
     let mut rng = stream(7, Purpose::Actions);
@@ -88,8 +95,8 @@ fn zeros(lengths: &[Vec<usize>]) -> Vec<Vec<f64>> {
     lengths.iter().map(|lengths| vec![0.0; lengths.len()]).collect()
 }
 
-fn of_episodes(spec: &PolicySpec, n_envs: usize) -> Rollout {
-    Rollout::of_episodes(n_envs, O, spec.action.width())
+fn of_episodes(spec: &PolicySpec, n_envs: usize) -> RolloutBuffer {
+    RolloutBuffer::of_episodes(n_envs, O, spec.action.width())
 }
 
 fn epopt(base: Box<dyn BaseAlgorithm>, epsilon: f64, full_iterations: u64) -> Epopt {
@@ -110,7 +117,7 @@ fn epopt_with_epsilon_1_equals_its_base() {
             let [a2c, ppo] = bases(9, 2, &wrapped);
             let mut epopt = epopt(if which == 0 { a2c } else { ppo }, 1.0, 0);
             for _ in 0..3 {
-                let fixed = Rollout::new(9, 6, O, action.width());
+                let fixed = RolloutBuffer::new(9, 6, O, action.width());
                 let fixed = play(&plain, &lengths, &zeros(&lengths), fixed);
                 let complete = play(&wrapped, &lengths, &zeros(&lengths), of_episodes(&spec, 6));
                 let expected = base.update(&mut plain, &fixed, 1.0).expect("an update");
@@ -191,7 +198,7 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
     for lstm in [None, Some(8)] {
         let spec = spec(DISCRETE, lstm);
         for which in 0..2 {
-            let base = |policy: &Policy| {
+            let base = |policy: &TrainablePolicy| {
                 let [a2c, ppo] = bases(1, 1, policy);
                 if which == 0 { a2c } else { ppo }
             };
@@ -199,7 +206,8 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
             let rollout = play(&policy, &lengths, &returns, of_episodes(&spec, 4));
             let mut worst: Vec<EpisodeSlice> = rollout.episodes().to_vec();
             worst.retain(|span| span.episode_return < 3.0);
-            let alone: Vec<Rollout> = worst.iter().map(|span| rollout.select(&[*span]).expect("an episode")).collect();
+            let alone: Vec<RolloutBuffer> =
+                worst.iter().map(|span| rollout.select(&[*span]).expect("an episode")).collect();
 
             let config =
                 EpoptConfig { epsilon: 0.5, full_iterations: 0, update_per_episode: true, ..Default::default() };
@@ -210,7 +218,7 @@ fn each_kept_episode_can_have_an_update_of_its_own() {
 
             let mut other = moved(&spec);
             let mut each = base(&other);
-            let parts: Vec<&Rollout> = alone.iter().collect();
+            let parts: Vec<&RolloutBuffer> = alone.iter().collect();
             let expected = each.update_many(&mut other, &parts, 1.0).expect("an update");
             assert_eq!(policy.weights(), other.weights(), "{lstm:?}");
             assert_eq!(UpdateStats { selection: None, ..stats }, expected, "{lstm:?}");
@@ -246,8 +254,8 @@ fn an_epoch_of_ppo_is_a_round_of_all_kept_episodes() {
         let spec = spec(DISCRETE, lstm);
         let rollout = play(&moved(&spec), &lengths, &returns, of_episodes(&spec, 4));
         let select = |span: &EpisodeSlice| rollout.select(&[*span]).expect("an episode");
-        let alone: Vec<Rollout> = rollout.episodes().iter().map(select).collect();
-        let parts: Vec<&Rollout> = alone.iter().collect();
+        let alone: Vec<RolloutBuffer> = rollout.episodes().iter().map(select).collect();
+        let parts: Vec<&RolloutBuffer> = alone.iter().collect();
         let after = |updates: usize, n_epochs: usize| {
             let mut policy = moved(&spec);
             let config = PpoConfig { n_epochs, learning_rate: 3e-3, ..PpoConfig::default() };
@@ -266,7 +274,7 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
     let (lengths, returns) = eight();
     let spec = spec(DISCRETE, Some(8));
     for which in 0..2 {
-        let fresh = |policy: &Policy| {
+        let fresh = |policy: &TrainablePolicy| {
             let [a2c, ppo] = bases(1, 1, policy);
             epopt(if which == 0 { a2c } else { ppo }, 0.5, 2)
         };
@@ -278,7 +286,7 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
                 if resumed_after == Some(iteration) {
                     let json = serde_json::to_string(&algorithm.state()).expect("JSON");
                     let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
-                    policy = Policy::from_weights(spec.clone(), &policy.weights()).expect("a policy");
+                    policy = TrainablePolicy::from_weights(spec.clone(), &policy.weights()).expect("a policy");
                     algorithm = fresh(&policy);
                     algorithm.load_state(&state).expect("a state that fits");
                 }
@@ -302,9 +310,9 @@ fn epsilon_falls_after_full_iterations_also_when_resumed() {
 
 /// Returns a rollout in which every number encodes its position: the sample with index p = t·N + n has the observation
 /// (p, -p), and its other numbers are functions of p.
-fn coded(lengths: &[Vec<usize>]) -> Rollout {
+fn coded(lengths: &[Vec<usize>]) -> RolloutBuffer {
     let n_envs = lengths.len();
-    let mut rollout = Rollout::of_episodes(n_envs, 2, 1);
+    let mut rollout = RolloutBuffer::of_episodes(n_envs, 2, 1);
     rollout.begin(&vec![1.0; 2 * n_envs]);
     let ends: Vec<Vec<usize>> = lengths
         .iter()
@@ -337,7 +345,7 @@ fn coded(lengths: &[Vec<usize>]) -> Rollout {
 }
 
 /// Returns the numbers and the flags of sample `p` of a rollout made by [`coded`], or selected from such a rollout.
-fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
+fn at(rollout: &RolloutBuffer, p: usize) -> (Vec<f32>, [bool; 2]) {
     let trajectories = rollout.trajectories().expect("a finished rollout");
     let numbers = [
         rollout.observations()[2 * p],
@@ -352,7 +360,7 @@ fn at(rollout: &Rollout, p: usize) -> (Vec<f32>, [bool; 2]) {
 }
 
 /// Generates a rollout with episodes in up to six environments, and a selection of these episodes.
-fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
+fn some_episodes() -> impl Strategy<Value = (RolloutBuffer, Vec<EpisodeSlice>)> {
     let lengths = prop::collection::vec(prop::collection::vec(1usize..12, 1..6), 1..7);
     (lengths, prop::collection::vec(any::<bool>(), 36)).prop_map(|(lengths, choice)| {
         let rollout = coded(&lengths);
@@ -368,7 +376,11 @@ fn some_episodes() -> impl Strategy<Value = (Rollout, Vec<EpisodeSlice>)> {
 }
 
 /// Computes the estimates of an episode as if it were alone in the rollout.
-fn alone(rollout: &Rollout, episode: &EpisodeSlice, estimate: &dyn Fn(&Trajectories<'_>) -> Estimates) -> Estimates {
+fn alone(
+    rollout: &RolloutBuffer,
+    episode: &EpisodeSlice,
+    estimate: &dyn Fn(&Trajectories<'_>) -> Estimates,
+) -> Estimates {
     let whole = rollout.trajectories().expect("finished");
     let places = || (0..episode.length).map(|t| (episode.start + t) * rollout.n_envs() + episode.environment);
     let numbers = |data: &[f32]| places().map(|p| data[p]).collect::<Vec<_>>();
@@ -473,14 +485,14 @@ fn episodes_that_a_rollout_does_not_hold_are_refused() {
     }
     let policy = moved(&spec(DISCRETE, None));
     let [base, _] = bases(1, 1, &policy);
-    let unfinished = Rollout::of_episodes(2, O, 1);
+    let unfinished = RolloutBuffer::of_episodes(2, O, 1);
     let result = epopt(base, 0.5, 0).update(&mut moved(&spec(DISCRETE, None)), &unfinished, 1.0);
     assert!(matches!(result, Err(Error::RolloutLength { .. })), "{result:?}");
 }
 
 /// Returns a loss that depends on every output of the policy, as the mean over the samples of a packed `rollout`, and
 /// its gradient.
-fn loss_of(policy: &TorchPolicy, rollout: &Rollout) -> (f64, Vec<f32>) {
+fn loss_of(policy: &TorchPolicy, rollout: &RolloutBuffer) -> (f64, Vec<f32>) {
     let sequences =
         Sequences::new(policy.spec(), rollout.n_steps(), rollout.observations(), rollout.starts(), rollout.memory())
             .and_then(|sequences| sequences.with_lengths(rollout.lengths().expect("packed")))
@@ -580,7 +592,7 @@ const CARTPOLES: usize = 4;
 const COUNT: usize = 10;
 
 /// Returns a recurrent policy that ignores observations and pushes to either side with equal probability.
-fn blind(input_size: usize) -> Policy {
+fn blind(input_size: usize) -> TrainablePolicy {
     perturb_torch::register();
     let spec = PolicySpec {
         observation_size: input_size,
@@ -590,16 +602,16 @@ fn blind(input_size: usize) -> Policy {
     };
     let mut weights = moved(&spec).weights();
     weights.iter_mut().filter(|array| array.name.starts_with("policy")).for_each(|array| array.data.fill(0.0));
-    Policy::from_weights(spec, &weights).expect("a policy")
+    TrainablePolicy::from_weights(spec, &weights).expect("a policy")
 }
 
 /// Collects two rollouts of complete episodes. Returns each with the episodes that ended in it, and the final
 /// normalisers.
-fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<EndedEpisode>)>, Normalisers) {
+fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(RolloutBuffer, Vec<EndedEpisode>)>, Normalisers) {
     let servers = connect(servers);
     let mut observations = Vec::new();
     let mut session =
-        Session::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");
+        ClientSession::open(&servers, &options("CartPole", CARTPOLES, 1), &mut observations).expect("a session");
     let size = session.observation_size();
     let policy = blind(size);
     let inputs = Inputs::new(size, policy.spec().action, CARTPOLES, false);
@@ -607,12 +619,12 @@ fn collect(servers: &[PrivateServer], normalised: bool) -> (Vec<(Rollout, Vec<En
         observations: normalised.then(|| ObservationNormaliser::new(size)),
         rewards: normalised.then(|| RewardNormaliser::new(CARTPOLES, 0.9)),
     };
-    let mut player = Player::new(policy.spec(), inputs, CARTPOLES, 1, normalisers, Role::training(1));
+    let mut player = Player::new(policy.spec(), inputs, CARTPOLES, 1, normalisers, PlayerRole::training(1));
     player.begin(&observations, None).expect("observations");
     let mut collector = Collector::new(player);
     let mut collected = Vec::new();
     for _ in 0..2 {
-        let mut rollout = Rollout::of_episodes(CARTPOLES, size, 1);
+        let mut rollout = RolloutBuffer::of_episodes(CARTPOLES, size, 1);
         let mut ended = Vec::new();
         let on_episode = |episode: &EndedEpisode| ended.push(episode.clone());
         let episodes = CollectUntil::Episodes(COUNT);
@@ -668,7 +680,7 @@ fn unseen_steps_are_no_part_of_the_statistics() {
     let (raw, _) = collect(&server, false);
     let (normalised, normalisers) = collect(&server, true);
     let mut rows = Vec::new(); // the session's first observations, later all observations that the policy acted on
-    Session::open(&connect(&server), &options("CartPole", CARTPOLES, 1), &mut rows).expect("a session");
+    ClientSession::open(&connect(&server), &options("CartPole", CARTPOLES, 1), &mut rows).expect("a session");
     let size = rows.len() / CARTPOLES;
     let mut seen = 0;
     let mut unseen = 0;
@@ -716,8 +728,8 @@ const ENVS: usize = 16;
 
 /// Plays episodes of one step with a choice of two arms. The safe arm always pays 0. The risky arm pays 1, but -2.5 in
 /// a fifth of the environments, so its mean is 0.3.
-fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
-    let mut rollout = Rollout::of_episodes(ENVS, 1, 1);
+fn pull(policy: &TrainablePolicy, rng: &mut ChaCha8Rng, episodes: usize) -> RolloutBuffer {
+    let mut rollout = RolloutBuffer::of_episodes(ENVS, 1, 1);
     let mut actor = Actor::new(policy.spec(), ENVS);
     actor.load(&policy.weights()).expect("weights that fit");
     let mut acts = ActorOutput::new(policy.spec().action, ENVS);
@@ -749,12 +761,12 @@ fn pull(policy: &Policy, rng: &mut ChaCha8Rng, episodes: usize) -> Rollout {
     rollout
 }
 
-fn a2c(policy: &Policy) -> Box<dyn BaseAlgorithm> {
+fn a2c(policy: &TrainablePolicy) -> Box<dyn BaseAlgorithm> {
     let config = A2cConfig { learning_rate: 7e-3, ..A2cConfig::default() };
     Box::new(A2c::new(config, policy).expect("valid settings"))
 }
 
-fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
+fn ppo(policy: &TrainablePolicy) -> Box<dyn BaseAlgorithm> {
     let config = PpoConfig { learning_rate: 3e-3, ..PpoConfig::default() };
     Box::new(Ppo::new(config, policy, 5).expect("valid settings"))
 }
@@ -765,12 +777,12 @@ fn ppo(policy: &Policy) -> Box<dyn BaseAlgorithm> {
 #[case::a2c(a2c, 1500)]
 #[case::ppo(ppo, 100)]
 fn epopt_avoids_catastrophes_that_its_base_accepts(
-    #[case] base: fn(&Policy) -> Box<dyn BaseAlgorithm>,
+    #[case] base: fn(&TrainablePolicy) -> Box<dyn BaseAlgorithm>,
     #[case] updates: usize,
     #[values(0.2, 1.0)] epsilon: f64,
 ) {
     let spec = PolicySpec { observation_size: 1, action: ActionKind::Discrete { n: 2 }, hidden: vec![8], lstm: None };
-    let mut policy = Policy::new(spec, 5).expect("a policy");
+    let mut policy = TrainablePolicy::new(spec, 5).expect("a policy");
     let mut rng = stream(5, Purpose::Actions);
     let mut algorithm = epopt(base(&policy), epsilon, 0);
     for _ in 0..updates {

@@ -1,6 +1,6 @@
 //! Compares feed-forward policies with libtorch: acting, gradients and updates.
 
-use perturb_learner::policy::Policy;
+use perturb_learner::policy::TrainablePolicy;
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{
     Acting, ActionKind, Actor, ActorOutput, Differentiator, Losses, Objective, Optimiser, PolicySpec, Samples,
@@ -35,7 +35,7 @@ fn torch(spec: &PolicySpec, weights: &[f32]) -> TorchPolicy {
 fn weights_survive_a_round_trip() {
     let spec = spec(CONTINUOUS, &[64, 64]);
     let weights = moved(&spec).weights();
-    assert_eq!(Policy::from_weights(spec, &weights).expect("a policy").weights(), weights);
+    assert_eq!(TrainablePolicy::from_weights(spec, &weights).expect("a policy").weights(), weights);
 }
 
 /// Tolerance for outputs. Acting and libtorch add in different orders, and acting's tanh has an error of up to 3e-7.

@@ -2,8 +2,8 @@
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{RolloutBuffer, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{ActionKind, Actor, ActorOutput, PolicySpec};
 use perturb_settings::{A2cConfig, PpoConfig, Schedule, SettingError};
@@ -65,22 +65,22 @@ impl Identity {
 
 /// A policy and a task, with the state of a training loop.
 struct Training {
-    policy: Policy,
+    policy: TrainablePolicy,
     actor: Actor,
     task: Identity,
     rng: ChaCha8Rng,
-    rollout: Rollout,
+    rollout: RolloutBuffer,
 }
 
 impl Training {
     fn new(action: ActionKind, n_steps: usize) -> Self {
         let spec = PolicySpec { observation_size: action.outputs(), action, hidden: vec![32, 32], lstm: None };
         Training {
-            policy: Policy::new(spec.clone(), 5).expect("a policy"),
+            policy: TrainablePolicy::new(spec.clone(), 5).expect("a policy"),
             actor: Actor::new(&spec, N_ENVS),
             task: Identity::new(action),
             rng: stream(5, Purpose::Actions),
-            rollout: Rollout::new(n_steps, N_ENVS, spec.observation_size, action.width()),
+            rollout: RolloutBuffer::new(n_steps, N_ENVS, spec.observation_size, action.width()),
         }
     }
 
@@ -229,7 +229,7 @@ fn the_loss_is_the_weighted_sum_of_its_parts() {
         let penalties = algorithms.into_iter().map(|mut algorithm| {
             let spec = training.policy.spec().clone();
             let weights = training.policy.weights();
-            let mut policy = Policy::from_weights(spec, &weights).expect("a policy");
+            let mut policy = TrainablePolicy::from_weights(spec, &weights).expect("a policy");
             let stats = algorithm.update(&mut policy, &training.rollout, 1.0).expect("an update");
             let penalty = kl_coef * stats.kl_divergence.unwrap_or(0.0);
             let sum = stats.policy_gradient_loss + ent_coef * stats.entropy_loss + vf_coef * stats.value_loss + penalty;
@@ -248,7 +248,8 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
 ) {
     let mut training = Training::new(action, 8);
     training.collect();
-    let copy = || Policy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
+    let copy =
+        || TrainablePolicy::from_weights(training.policy.spec().clone(), &training.policy.weights()).expect("a copy");
     let rollout = &training.rollout;
     let moved_by = |kl_coef| {
         let before = copy();
@@ -256,7 +257,7 @@ fn a_penalty_on_the_divergence_keeps_the_policy_near(
         let config = PpoConfig { n_steps: 8, n_minibatches, learning_rate: 1e-2, kl_coef, ..PpoConfig::default() };
         let mut ppo = Ppo::new(config, &after, 1).expect("valid settings");
         ppo.update(&mut after, rollout, 1.0).expect("an update");
-        let distributions = |policy: &Policy| {
+        let distributions = |policy: &TrainablePolicy| {
             let sequences = Sequences::new(policy.spec(), 8, rollout.observations(), rollout.starts(), &[]);
             let policy = TorchPolicy::new(policy.spec(), policy.flat_weights()).expect("a policy");
             policy.evaluate(&sequences.expect("shapes that fit"), &Tensor::of_slice(rollout.actions())).distributions
@@ -285,7 +286,7 @@ fn same_seed_and_resume_give_same_bytes() {
                     let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
                     let spec = training.policy.spec().clone();
                     let weights = training.policy.weights();
-                    training.policy = Policy::from_weights(spec, &weights).expect("a policy");
+                    training.policy = TrainablePolicy::from_weights(spec, &weights).expect("a policy");
                     (_, algorithms) = start(action);
                     algorithms[which].load_state(&state).expect("a state that fits");
                 }
@@ -311,7 +312,7 @@ fn a_state_of_another_algorithm_is_refused() {
 fn loss_that_is_not_finite_changes_nothing() {
     let mut training = Training::new(DISCRETE, 8);
     training.collect();
-    let mut rollout = Rollout::new(8, N_ENVS, 4, 1);
+    let mut rollout = RolloutBuffer::new(8, N_ENVS, 4, 1);
     for _ in 0..8 {
         let step = RolloutStep {
             observations: &[0.5; 4 * N_ENVS],

@@ -5,7 +5,7 @@ use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo};
 use perturb_learner::checkpoint::Checkpoint;
 use perturb_learner::logging::Progress;
-use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_learner::rollout::{RolloutBuffer, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, normal, stream};
 use perturb_policy::{ActionKind, PolicySpec};
@@ -44,10 +44,10 @@ enum Limit {
 
 /// Returns a rollout of random numbers in which the step limit ends two episodes: one in the middle of the rollout, one
 /// in its last step. The value of every final observation is 1.5.
-fn rollout(spec: &PolicySpec, limit: Limit) -> Rollout {
+fn rollout(spec: &PolicySpec, limit: Limit) -> RolloutBuffer {
     let mut rng = stream(7, Purpose::Actions);
     let mut numbers = |count: usize| (0..count).map(|_| normal(&mut rng) as f32).collect::<Vec<f32>>();
-    let mut rollout = Rollout::new(N_STEPS, N_ENVS, spec.observation_size, spec.action.width());
+    let mut rollout = RolloutBuffer::new(N_STEPS, N_ENVS, spec.observation_size, spec.action.width());
     rollout.begin(&vec![0.0; N_ENVS * spec.memory_size()]);
     let is_limit = |t: usize, n: usize| (t, n) == (2, 1) || (t, n) == (N_STEPS - 1, 2);
     for t in 0..N_STEPS {

@@ -3,8 +3,8 @@
 
 use perturb_learner::algorithm::{A2c, Algorithm, AlgorithmState, Ppo};
 use perturb_learner::error::Error;
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Rollout, RolloutStep};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{RolloutBuffer, RolloutStep};
 use perturb_policy::random::{Purpose, normal, stream, uniform};
 use perturb_policy::{ActionKind, Actor, ActorOutput, PolicySpec, Weights};
 use perturb_settings::{A2cConfig, PpoConfig};
@@ -25,7 +25,7 @@ fn spec(action: ActionKind, hidden: &[usize], width: usize) -> PolicySpec {
 /// Returns weights in which every number, including biases and log_std, differs from its initial value by about 0.1.
 fn moved(spec: &PolicySpec) -> Weights {
     let mut rng = stream(9, Purpose::Weights);
-    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    let mut weights = TrainablePolicy::new(spec.clone(), 1).expect("a policy").weights();
     weights.iter_mut().flat_map(|array| &mut array.data).for_each(|x| *x += 0.1 * normal(&mut rng) as f32);
     weights
 }
@@ -188,7 +188,7 @@ fn memory_is_emptied_per_environment() {
 
 #[test]
 fn a_policy_begins_with_orthogonal_weights_and_zero_biases() {
-    let weights = Policy::new(spec(CONTINUOUS, &[32, 24], 16), 3).expect("a policy").weights();
+    let weights = TrainablePolicy::new(spec(CONTINUOUS, &[32, 24], 16), 3).expect("a policy").weights();
     let shapes: Vec<_> = weights.iter().map(|array| (array.name.as_str(), array.shape.as_slice())).collect();
     assert_eq!(
         shapes[4..],
@@ -268,13 +268,13 @@ impl Recall {
 
 /// A policy and a task, with the state of a training loop.
 struct Training {
-    policy: Policy,
+    policy: TrainablePolicy,
     actor: Actor,
     task: Recall,
     observations: Vec<f32>,
     starts: [bool; N_ENVS],
     rng: ChaCha8Rng,
-    rollout: Rollout,
+    rollout: RolloutBuffer,
 }
 
 const TWO: ActionKind = ActionKind::Discrete { n: 2 };
@@ -284,13 +284,13 @@ impl Training {
         let spec = PolicySpec { observation_size: 2, action: TWO, hidden: vec![16], lstm };
         let mut task = Recall { rng: stream(11, Purpose::Weights), cues: [0; N_ENVS], t: 0 };
         Training {
-            policy: Policy::new(spec.clone(), 5).expect("a policy"),
+            policy: TrainablePolicy::new(spec.clone(), 5).expect("a policy"),
             actor: Actor::new(&spec, N_ENVS),
             observations: task.observations(),
             task,
             starts: [true; N_ENVS],
             rng: stream(5, Purpose::Actions),
-            rollout: Rollout::new(n_steps, N_ENVS, 2, 1),
+            rollout: RolloutBuffer::new(n_steps, N_ENVS, 2, 1),
         }
     }
 
@@ -432,7 +432,7 @@ fn same_seed_and_resume_give_same_bytes() {
                 let state: AlgorithmState = serde_json::from_str(&json).expect("a state");
                 let spec = training.policy.spec().clone();
                 let weights = training.policy.weights();
-                training.policy = Policy::from_weights(spec, &weights).expect("a policy");
+                training.policy = TrainablePolicy::from_weights(spec, &weights).expect("a policy");
                 (_, algorithms) = start();
                 algorithms[which].load_state(&state).expect("a state that fits");
             }
@@ -469,7 +469,7 @@ fn wrong_recurrent_arrays_are_refused() {
     ));
     let spec = PolicySpec { lstm: Some(0), ..training.policy.spec().clone() };
     assert!(matches!(
-        Policy::new(spec, 1),
+        TrainablePolicy::new(spec, 1),
         Err(Error::Policy(perturb_policy::Error::Empty { name: "the width of the LSTM" }))
     ));
 }

@@ -3,13 +3,13 @@
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::algorithm::{A2c, Algorithm, Ppo, gae};
 use perturb_learner::checkpoint::Checkpoint;
-use perturb_learner::client::{EndedEpisode, OpenOptions, Servers, Session, StepReply};
+use perturb_learner::client::{ClientSession, EndedEpisode, OpenOptions, Servers, StepReply};
 use perturb_learner::evaluation::test;
-use perturb_learner::policy::Policy;
-use perturb_learner::rollout::{Collector, Normalisers, Rollout, RolloutStep};
+use perturb_learner::policy::TrainablePolicy;
+use perturb_learner::rollout::{Collector, Normalisers, RolloutBuffer, RolloutStep};
 use perturb_learner::training::{RunDirectory, train};
 use perturb_policy::random::{Purpose, stream, uniform};
-use perturb_policy::{ActionKind, Actor, ActorOutput, CollectUntil, Inputs, Player, PolicySpec, Role};
+use perturb_policy::{ActionKind, Actor, ActorOutput, CollectUntil, Inputs, Player, PlayerRole, PolicySpec};
 use perturb_protocol::Version;
 use perturb_settings::{self as settings, A2cConfig, PpoConfig, TrainConfig};
 
@@ -22,19 +22,23 @@ const N_ENVS: usize = 3;
 
 /// Returns a small recurrent policy whose inputs contain the outcome of the previous step: last action, last reward,
 /// and whether an episode ended.
-fn policy(observation_size: usize, action: ActionKind) -> Policy {
+fn policy(observation_size: usize, action: ActionKind) -> TrainablePolicy {
     let observation_size = Inputs::new(observation_size, action, 1, true).size();
     moved(&PolicySpec { observation_size, action, hidden: vec![8], lstm: Some(6) })
 }
 
-fn collector<'a>(servers: &'a Servers, options: &OpenOptions, policy: &Policy) -> (Session<'a>, Collector) {
+fn collector<'a>(
+    servers: &'a Servers,
+    options: &OpenOptions,
+    policy: &TrainablePolicy,
+) -> (ClientSession<'a>, Collector) {
     let mut observations = Vec::new();
-    let session = Session::open(servers, options, &mut observations).expect("a session");
+    let session = ClientSession::open(servers, options, &mut observations).expect("a session");
     let inputs = Inputs::new(session.observation_size(), policy.spec().action, options.num_envs, true);
     let n = options.num_envs;
     let trial = options.episodes_per_trial;
     let none = Normalisers::default();
-    let mut player = Player::new(policy.spec(), inputs, n, trial, none, Role::training(1));
+    let mut player = Player::new(policy.spec(), inputs, n, trial, none, PlayerRole::training(1));
     player.begin(&observations, None).expect("observations");
     (session, Collector::new(player))
 }
@@ -56,14 +60,19 @@ fn beside(action: ActionKind, taken: f32, reward: f32) -> Vec<f32> {
 
 /// Returns the rollout of a plain recurrent policy whose observations this function extends itself: to `[s, a, r, 0]`,
 /// or to `[s, 0, 0, 0]` at the start of an episode.
-fn extended_by_hand(servers: &Servers, options: &OpenOptions, policy: &Policy, n_steps: usize) -> Rollout {
+fn extended_by_hand(
+    servers: &Servers,
+    options: &OpenOptions,
+    policy: &TrainablePolicy,
+    n_steps: usize,
+) -> RolloutBuffer {
     let spec = policy.spec();
     let n = options.num_envs;
     let mut reply = StepReply::default();
-    let mut session = Session::open(servers, options, &mut reply.observations).expect("a session");
+    let mut session = ClientSession::open(servers, options, &mut reply.observations).expect("a session");
     let size = session.observation_size();
     let extra = spec.observation_size - size;
-    let mut rollout = Rollout::new(n_steps, n, spec.observation_size, spec.action.width());
+    let mut rollout = RolloutBuffer::new(n_steps, n, spec.observation_size, spec.action.width());
     let mut actor = Actor::new(spec, n);
     actor.load(&policy.weights()).expect("weights that fit");
     let mut rng = stream(1, Purpose::Actions);
@@ -126,7 +135,7 @@ fn trial_of_one_episode_equals_longer_inputs() {
         let options = options(environment, N_ENVS, 1);
         let policy = policy(size, action);
         let expected = extended_by_hand(&servers, &options, &policy, n_steps);
-        let mut rollout = Rollout::new(n_steps, N_ENVS, policy.spec().observation_size, 1);
+        let mut rollout = RolloutBuffer::new(n_steps, N_ENVS, policy.spec().observation_size, 1);
         let (mut session, mut collector) = collector(&servers, &options, &policy);
         collector
             .collect(&mut session, policy.flat_weights(), CollectUntil::Steps(n_steps), &mut rollout, |_| {})
@@ -134,7 +143,7 @@ fn trial_of_one_episode_equals_longer_inputs() {
         assert!(rollout.starts()[N_ENVS..].contains(&true), "an episode has ended");
         assert_eq!(contents(&rollout), contents(&expected), "{environment}");
         for which in 0..2 {
-            let updated = |rollout: &Rollout| {
+            let updated = |rollout: &RolloutBuffer| {
                 let mut policy = moved(policy.spec());
                 let [a2c, ppo] = bases(n_steps, 3, &policy);
                 let stats = [a2c, ppo][which].update(&mut policy, rollout, 1.0);
@@ -148,19 +157,19 @@ fn trial_of_one_episode_equals_longer_inputs() {
 /// Rollouts of one step each, so that their `memory` is the memory before each step; and the ended episodes with the
 /// steps in which they ended.
 struct Steps {
-    rollouts: Vec<Rollout>,
+    rollouts: Vec<RolloutBuffer>,
     ended: Vec<(usize, EndedEpisode)>,
 }
 
 impl Steps {
-    fn collect(environment: &str, policy: &Policy, episodes_per_trial: u32, n_steps: usize) -> Self {
+    fn collect(environment: &str, policy: &TrainablePolicy, episodes_per_trial: u32, n_steps: usize) -> Self {
         let server = [server()];
         let servers = connect(&server);
         let options = options(environment, N_ENVS, episodes_per_trial);
         let (mut session, mut collector) = collector(&servers, &options, policy);
         let mut steps = Steps { rollouts: Vec::new(), ended: Vec::new() };
         for t in 0..n_steps {
-            let mut rollout = Rollout::new(1, N_ENVS, policy.spec().observation_size, 1);
+            let mut rollout = RolloutBuffer::new(1, N_ENVS, policy.spec().observation_size, 1);
             let on_episode = |episode: &EndedEpisode| steps.ended.push((t, episode.clone()));
             let one = CollectUntil::Steps(1);
             collector.collect(&mut session, policy.flat_weights(), one, &mut rollout, on_episode).expect("a rollout");
@@ -232,7 +241,7 @@ fn advantages_run_across_the_episodes_of_a_trial() {
     let server = [server()];
     let servers = connect(&server);
     let policy = policy(4, TWO);
-    let mut rollout = Rollout::new(150, N_ENVS, policy.spec().observation_size, 1);
+    let mut rollout = RolloutBuffer::new(150, N_ENVS, policy.spec().observation_size, 1);
     let (mut session, mut collector) = collector(&servers, &options("CartPole", N_ENVS, 2), &policy);
     let mut lengths: [Vec<(u32, u32)>; N_ENVS] = Default::default();
     let on_episode = |end: &EndedEpisode| lengths[end.slot].push((end.length, end.episode_in_trial));
@@ -290,7 +299,7 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     let mut checkpoint = outcome.checkpoint;
     assert_eq!(checkpoint.policy.observation_size, 4 + 2 + 1 + 1);
     let spec = PolicySpec { hidden: vec![], lstm: Some(4), ..checkpoint.policy.clone() };
-    let mut weights = Policy::new(spec.clone(), 1).expect("a policy").weights();
+    let mut weights = TrainablePolicy::new(spec.clone(), 1).expect("a policy").weights();
     let counting = 1e6f32;
     let rewarded = 1e6f32;
     for array in &mut weights {
@@ -362,7 +371,7 @@ const TRIAL: usize = 2 * EPISODE;
 /// A bandit task with two arms: one pays 1, the other pays nothing. The paying arm is drawn for every trial, and the
 /// observation does not show it.
 struct Bandits {
-    policy: Policy,
+    policy: TrainablePolicy,
     actor: Actor,
     inputs: Inputs,
     /// Whether the policy's memory lasts for a whole trial, as with RL². If not, it lasts for an episode.
@@ -370,7 +379,7 @@ struct Bandits {
     paying: [f32; ARMS],
     start: bool,
     rng: ChaCha8Rng,
-    rollout: Rollout,
+    rollout: RolloutBuffer,
 }
 
 impl Bandits {
@@ -378,9 +387,9 @@ impl Bandits {
         let inputs = Inputs::new(1, TWO, ARMS, rl2);
         let spec = PolicySpec { observation_size: inputs.size(), action: TWO, hidden: vec![16], lstm: Some(16) };
         Bandits {
-            policy: Policy::new(spec.clone(), 5).expect("a policy"),
+            policy: TrainablePolicy::new(spec.clone(), 5).expect("a policy"),
             actor: Actor::new(&spec, ARMS),
-            rollout: Rollout::new(n_trials * TRIAL, ARMS, inputs.size(), 1),
+            rollout: RolloutBuffer::new(n_trials * TRIAL, ARMS, inputs.size(), 1),
             inputs,
             by_trial: rl2,
             paying: [0.0; ARMS],
@@ -443,7 +452,7 @@ impl Bandits {
     }
 }
 
-fn bandits_a2c(policy: &Policy) -> A2c {
+fn bandits_a2c(policy: &TrainablePolicy) -> A2c {
     let config = A2cConfig { n_steps: TRIAL, learning_rate: 7e-3, ..A2cConfig::default() };
     A2c::new(config, policy).expect("valid settings")
 }

@@ -1,7 +1,7 @@
 //! Snapshots that are too long for one message are taken and restored in parts.
 
 use bytes::Bytes;
-use perturb_learner::client::{OpenOptions, PrivateServer, Session, StepReply};
+use perturb_learner::client::{ClientSession, OpenOptions, PrivateServer, StepReply};
 use perturb_protocol::{Distribution, Interval, Version};
 use rstest::rstest;
 
@@ -36,7 +36,7 @@ fn long_snapshots(num_envs: usize) -> OpenOptions {
     OpenOptions { parameters, version: Version::D, ..options("CartPole", num_envs, 1) }
 }
 
-fn bytes_after(session: &mut Session<'_>, actions: &[u8]) -> Vec<Vec<f32>> {
+fn bytes_after(session: &mut ClientSession<'_>, actions: &[u8]) -> Vec<Vec<f32>> {
     let mut reply = StepReply::default();
     (0..3)
         .map(|_| {
@@ -59,7 +59,7 @@ fn long_snapshots_are_followed_by_the_same_bytes(
     let servers: Vec<PrivateServer> = (0..n_servers).map(|_| server()).collect();
     let servers = connect(&servers);
     let mut observations = Vec::new();
-    let mut session = Session::open(&servers, &options, &mut observations).expect("a session");
+    let mut session = ClientSession::open(&servers, &options, &mut observations).expect("a session");
     let (n, actions) = (options.num_envs, vec![0; options.num_envs * action_bytes]);
     bytes_after(&mut session, &actions);
     let saved = session.snapshot(0..n).expect("snapshots");

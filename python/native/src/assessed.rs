@@ -8,7 +8,7 @@ use pyo3::exceptions::PyOSError;
 use pyo3::prelude::*;
 
 use crate::failure::{INVALID, failure};
-use crate::records::Records;
+use crate::records::PythonRecords;
 
 /// The fields of [`PolicyMetadata`] for Python: training version, training steps, seed of the tests, episodes of each
 /// test, what the policy observed (`state` or `parameters`), and whether the policy was deterministic.
@@ -21,8 +21,8 @@ pub struct Assessment(ExternalEvaluation);
 #[pymethods]
 impl Assessment {
     #[new]
-    fn new(agent: String, policies: Vec<(KnownOf, PyRef<'_, Records>)>) -> PyResult<Self> {
-        let policy = |(known, records): (KnownOf, PyRef<'_, Records>)| {
+    fn new(agent: String, policies: Vec<(KnownOf, PyRef<'_, PythonRecords>)>) -> PyResult<Self> {
+        let policy = |(known, records): (KnownOf, PyRef<'_, PythonRecords>)| {
             Ok(ExternalPolicy::new(known_of(known)?, records.0.clone()))
         };
         let policies = policies.into_iter().map(policy).collect::<PyResult<_>>()?;
@@ -47,12 +47,12 @@ impl Assessment {
     }
 
     /// Returns the metadata and the records of each policy.
-    fn policies(&self) -> Vec<(KnownOf, Records)> {
+    fn policies(&self) -> Vec<(KnownOf, PythonRecords)> {
         let of = |policy: &ExternalPolicy| {
             let PolicyMetadata { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
             let trained_on = trained_on.map(|version| version.to_string());
             let known = (trained_on, timesteps, seed, episodes, observe.to_string(), deterministic);
-            (known, Records(policy.records.clone()))
+            (known, PythonRecords(policy.records.clone()))
         };
         self.0.policies().iter().map(of).collect()
     }

@@ -6,10 +6,10 @@ use perturb_settings::ValueError;
 use pyo3::prelude::*;
 
 use crate::failure::{INVALID, failure};
-use crate::records::Records;
+use crate::records::PythonRecords;
 
 /// A condition: its name, and its policies, each with a key. Policies of two conditions are paired by equal keys.
-type NamedCondition<'py> = (String, Vec<(String, PyRef<'py, Records>)>);
+type NamedCondition<'py> = (String, Vec<(String, PyRef<'py, PythonRecords>)>);
 
 /// Compares conditions by their scores in the tests on the given sets. `score` is `success`, `return` or `length`.
 /// Returns JSON.

@@ -20,7 +20,7 @@ use tonic::Status;
 use crate::failure::{INVALID, LOST, MISMATCH, REFUSED, RequestFailure, UNREACHABLE, failure};
 
 /// A task folder as a Python tuple: the path of `perturb-server`, the path of the folder, and the digest of its files.
-type TaskFolder = (PathBuf, PathBuf, String);
+type TaskFolderTuple = (PathBuf, PathBuf, String);
 
 /// For each loaded task folder: its path, the digest of its files, and a catalogue that contains its task. A task stays
 /// in memory until the process ends, so each folder is loaded only once.
@@ -28,7 +28,7 @@ type TaskFolder = (PathBuf, PathBuf, String);
 static LOADED: Mutex<Vec<((PathBuf, String), Catalogue)>> = Mutex::new(Vec::new());
 
 #[cfg(feature = "mujoco")]
-fn catalogue_with((program, path, digest): TaskFolder) -> PyResult<Catalogue> {
+fn catalogue_with((program, path, digest): TaskFolderTuple) -> PyResult<Catalogue> {
     let mut loaded = LOADED.lock().unwrap_or_else(PoisonError::into_inner);
     let key = (path, digest);
     if let Some((_, catalogue)) = loaded.iter().find(|(other, _)| *other == key) {
@@ -42,7 +42,7 @@ fn catalogue_with((program, path, digest): TaskFolder) -> PyResult<Catalogue> {
 }
 
 #[cfg(not(feature = "mujoco"))]
-fn catalogue_with(_: TaskFolder) -> PyResult<Catalogue> {
+fn catalogue_with(_: TaskFolderTuple) -> PyResult<Catalogue> {
     Err(failure(INVALID, 0, "this package was built without MuJoCo, which task= needs here: leave server= out"))
 }
 
@@ -61,7 +61,7 @@ impl NativeServer {
     /// `perturb-server` process loads the task first, because a broken model can kill the process that loads it.
     #[new]
     #[pyo3(signature = (task = None))]
-    fn new(py: Python<'_>, task: Option<TaskFolder>) -> PyResult<Self> {
+    fn new(py: Python<'_>, task: Option<TaskFolderTuple>) -> PyResult<Self> {
         let server = py.detach(|| {
             let catalogue = task.map_or_else(|| Ok(tasks::catalogue()), catalogue_with)?;
             server::EmbeddedServer::start(catalogue).map_err(|error| failure(UNREACHABLE, 0, error.to_string()))

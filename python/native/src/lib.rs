@@ -47,15 +47,15 @@ mod _native {
     #[pymodule_export]
     use super::infos::Events;
     #[pymodule_export]
-    use super::policy::{Player, Policy};
+    use super::policy::{PythonPlayer, PythonPolicy};
     #[pymodule_export]
-    use super::records::{Records, metrics, published, read_results, wilson};
+    use super::records::{PythonRecords, metrics, published, read_results, wilson};
     #[pymodule_export]
-    use super::session::{Session, catalogue, note_fork};
+    use super::session::{PythonSession, catalogue, note_fork};
     #[pymodule_export]
     use super::sets::{heatmap_contexts, make_set, read_csv_set, read_sets};
     #[pymodule_export]
-    use super::testing::Tests;
+    use super::testing::PythonTests;
     /// Name of the test set that `perturb.sets.heatmap` makes. Reports draw the tests on it as heatmaps.
     #[pymodule_export]
     const HEATMAP_SET: &str = perturb_records::Heatmap::SET;

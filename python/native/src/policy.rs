@@ -11,8 +11,8 @@ use pyo3::prelude::*;
 use crate::failure::{POLICY, UNUSABLE, failure};
 
 /// A policy, loaded from a checkpoint.
-#[pyclass(frozen, module = "perturb._native")]
-pub struct Policy {
+#[pyclass(frozen, name = "Policy", module = "perturb._native")]
+pub struct PythonPolicy {
     pub(crate) checkpoint: Checkpoint,
     /// Identifies the policy by the number of its training iterations and a checksum of its weights.
     #[pyo3(get)]
@@ -20,7 +20,7 @@ pub struct Policy {
 }
 
 #[pymethods]
-impl Policy {
+impl PythonPolicy {
     /// Loads the checkpoint in a folder, or in the folder `checkpoint` below it.
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
@@ -103,11 +103,11 @@ impl Policy {
     }
 
     /// Makes a player for N environments. Their indices are successive numbers from `first_environment_index`.
-    fn player(&self, num_envs: usize, seed: u64, first_environment_index: u32) -> PyResult<Player> {
+    fn player(&self, num_envs: usize, seed: u64, first_environment_index: u32) -> PyResult<PythonPlayer> {
         let player =
             self.checkpoint.player(num_envs, seed, first_environment_index).map_err(|error| refused(&error))?;
         let finals = Vec::with_capacity(num_envs * player.observation_size());
-        Ok(Player(Mutex::new(Playing {
+        Ok(PythonPlayer(Mutex::new(Playing {
             player,
             action: self.checkpoint.policy.action,
             seed,
@@ -118,7 +118,7 @@ impl Policy {
     }
 }
 
-impl Policy {
+impl PythonPolicy {
     /// Checks that the server's environment `served` is the one that the policy was trained in.
     ///
     /// # Errors
@@ -130,8 +130,8 @@ impl Policy {
 
 /// A policy that chooses actions in N environments, with a separate memory for each environment. Only one thread at a
 /// time may use it.
-#[pyclass(frozen, module = "perturb._native")]
-pub struct Player(Mutex<Playing>);
+#[pyclass(frozen, name = "Player", module = "perturb._native")]
+pub struct PythonPlayer(Mutex<Playing>);
 
 struct Playing {
     player: perturb_policy::Player,
@@ -147,7 +147,7 @@ struct Playing {
 }
 
 #[pymethods]
-impl Player {
+impl PythonPlayer {
     /// Begins the first trial in every environment, with observations `[N, O]`.
     fn begin(&self, observations: PyReadonlyArray2<'_, f32>) -> PyResult<()> {
         self.own()?.begin(&observations)
@@ -170,7 +170,7 @@ impl Player {
     }
 }
 
-impl Player {
+impl PythonPlayer {
     fn own(&self) -> PyResult<MutexGuard<'_, Playing>> {
         match self.0.try_lock() {
             Ok(playing) => Ok(playing),

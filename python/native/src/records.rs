@@ -38,11 +38,11 @@ type ResultRow = (u64, f64, (f64, f64), f64, (f64, f64), f64, f64, (f64, f64), O
 type ResultsColumns<'py> = (Bound<'py, PyDict>, Vec<(String, String)>);
 
 /// The recorded tests of a policy.
-#[pyclass(frozen, module = "perturb._native")]
-pub struct Records(pub(crate) perturb_records::Records);
+#[pyclass(frozen, name = "Records", module = "perturb._native")]
+pub struct PythonRecords(pub(crate) perturb_records::Records);
 
 #[pymethods]
-impl Records {
+impl PythonRecords {
     /// Reads records from a Parquet file.
     #[staticmethod]
     fn read(path: PathBuf) -> PyResult<Self> {
@@ -190,7 +190,7 @@ impl Records {
     }
 }
 
-impl Records {
+impl PythonRecords {
     /// Returns the position of a parameter in the environment's list of parameters.
     fn place(&self, parameter: &str) -> PyResult<usize> {
         let names: Vec<&str> = self.0.about.parameters.iter().map(|it| it.name.as_str()).collect();

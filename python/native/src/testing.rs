@@ -14,14 +14,14 @@ use pyo3::prelude::*;
 
 use crate::failure::{INVALID, MALFORMED, UNUSABLE, failure};
 use crate::infos::Events;
-use crate::policy::Policy;
-use crate::records::Records;
-use crate::session::Opened;
+use crate::policy::PythonPolicy;
+use crate::records::PythonRecords;
+use crate::session::PythonOpened;
 use crate::sets::{Set, from_python};
 
 /// Plans and records the tests of a policy, one set after the other.
-#[pyclass(module = "perturb._native")]
-pub struct Tests {
+#[pyclass(name = "Tests", module = "perturb._native")]
+pub struct PythonTests {
     sets: Vec<TestSet>,
     episodes: u64,
     seed: u64,
@@ -35,7 +35,7 @@ pub struct Tests {
 }
 
 #[pymethods]
-impl Tests {
+impl PythonTests {
     #[new]
     fn new(
         sets: Vec<Set>,
@@ -71,7 +71,7 @@ impl Tests {
     /// environment must fit all sets, and must equal the environment that `policy` was trained in. In later tests, the
     /// environment must equal that of the first test.
     #[pyo3(signature = (opened, policy))]
-    fn opened(&mut self, opened: &Opened, policy: Option<&Policy>) -> PyResult<()> {
+    fn opened(&mut self, opened: &PythonOpened, policy: Option<&PythonPolicy>) -> PyResult<()> {
         let served = opened.served();
         if let Some((environment, _)) = &self.begun {
             if **environment == **served {
@@ -116,9 +116,9 @@ impl Tests {
     }
 
     /// Returns the records of all finished tests.
-    fn records(&self) -> PyResult<Records> {
+    fn records(&self) -> PyResult<PythonRecords> {
         let Some((_, records)) = &self.begun else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
-        Ok(Records(records.clone()))
+        Ok(PythonRecords(records.clone()))
     }
 }
 

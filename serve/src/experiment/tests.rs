@@ -1,4 +1,4 @@
-use perturb_experiment::{Folder, Plan};
+use perturb_experiment::{ExperimentFolder, Plan};
 
 use super::*;
 
@@ -24,8 +24,8 @@ impl ExperimentFixture {
         self.directory.path().canonicalize().unwrap()
     }
 
-    fn folder(&self) -> Folder {
-        Folder::new(&self.root().join("study"))
+    fn folder(&self) -> ExperimentFolder {
+        ExperimentFolder::new(&self.root().join("study"))
     }
 
     fn write(&self, cell: usize, name: &str, text: &str) {
@@ -71,7 +71,7 @@ fn cells_with_a_configuration_have_a_page() {
 #[test]
 fn the_fingerprint_covers_all_files_of_a_report() {
     let fixture = ExperimentFixture::new();
-    let record = perturb_experiment::Failure {
+    let record = perturb_experiment::FailureRecord {
         id: fixture.plan.cells[0].id.clone(),
         reason: "NaN".into(),
         commit: "x".into(),

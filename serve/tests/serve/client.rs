@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use perturb_checkpoint::Counters;
-use perturb_experiment::{CellResult, Folder, Plan, Training};
+use perturb_experiment::{CellResult, ExperimentFolder, Plan, Training};
 use perturb_records::TestResult;
 use perturb_serve::{ServeOptions, Server};
 use perturb_settings::TrainConfig;
@@ -40,7 +40,7 @@ impl Place {
         write(&folder.path().join("outside.csv"), "secret");
         write_training(&runs.join("one"), 30);
         let plan = Plan::parse("test", PLAN.into()).unwrap();
-        let study = Folder::new(&runs.join("study"));
+        let study = ExperimentFolder::new(&runs.join("study"));
         study.keep_plan(&plan).unwrap();
         study.cell(&plan.cells[0].id).write_result(&result(&plan.cells[0])).unwrap();
         write(&runs.join("pictures/over <b>.svg"), "<svg xmlns='http://www.w3.org/2000/svg'/>");

@@ -1,6 +1,6 @@
 //! Contents of the pages, and when they change.
 
-use perturb_experiment::{Folder, Plan};
+use perturb_experiment::{ExperimentFolder, Plan};
 use perturb_files::Lock;
 use perturb_protocol::Version;
 
@@ -170,7 +170,7 @@ fn a_locked_run_is_in_work() {
 #[test]
 fn a_cell_in_work_has_a_curve_until_it_is_done() {
     let place = Place::new();
-    let folder = Folder::new(&place.path("study"));
+    let folder = ExperimentFolder::new(&place.path("study"));
     let plan = Plan::load(&folder.plan_path()).unwrap();
     let cell = folder.cell(&plan.cells[1].id);
     let mut events = place.events("/events/study");
@@ -193,7 +193,7 @@ fn a_cell_in_work_has_a_curve_until_it_is_done() {
 #[test]
 fn an_old_report_says_so_until_it_is_built_again() {
     let place = Place::new();
-    let folder = Folder::new(&place.path("study"));
+    let folder = ExperimentFolder::new(&place.path("study"));
     let plan = Plan::load(&folder.plan_path()).unwrap();
     assert!(place.get("/report/study").body.contains("1 of 2 cells are done"));
     assert!(!place.get("/run/study").body.contains("newer than this report"));

@@ -1,12 +1,12 @@
 //! Disturbs actions: delay, repetition (`action_hold`), noise and scale.
 
 use super::{next_place, parameters::DisturbanceValues};
-use crate::env::{Action, ActionSpace, Draw, Error, Purpose, Stream};
+use crate::env::{Action, ActionSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the actions of one environment on their way to the physics. An action is stored as A numbers: a continuous
 /// action as one number per channel, a discrete action as the index of its choice (A = 1).
 pub(super) struct ActionPath {
-    space: ActionSpace,
+    space: ActionSpec,
     /// The action that acts until the client's first action arrives, `[A]`.
     neutral: Vec<f32>,
     /// A ring buffer of the client's actions that have not reached the physics yet, `[action_delay, A]`.
@@ -21,7 +21,7 @@ pub(super) struct ActionPath {
 
 impl ActionPath {
     /// Creates the path for actions of `space`. `neutral` is the environment's action with the least effect, `[A]`.
-    pub(super) fn new(space: ActionSpace, neutral: Vec<f32>) -> Self {
+    pub(super) fn new(space: ActionSpec, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
         Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
     }
@@ -57,7 +57,7 @@ impl ActionPath {
         let width = self.neutral.len();
         let is_held = values.action_hold > 0.0
             && step > 0
-            && Stream::at_step(draw, Purpose::ActionHold, step).unit() < values.action_hold;
+            && PhiloxStream::at_step(draw, DrawPurpose::ActionHold, step).unit() < values.action_hold;
         if values.action_delay == 0 {
             if !is_held {
                 self.held.copy_from_slice(action);
@@ -73,10 +73,10 @@ impl ActionPath {
         // Noise and scale change only `acting`, so a repeated action gets new noise.
         self.acting.copy_from_slice(&self.held);
         match self.space {
-            ActionSpace::Discrete(_) => Action::Discrete(self.acting[0] as u32),
-            ActionSpace::Continuous(channels) => {
+            ActionSpec::Discrete(_) => Action::Discrete(self.acting[0] as u32),
+            ActionSpec::Continuous(channels) => {
                 if values.action_noise > 0.0 {
-                    let mut stream = Stream::at_step(draw, Purpose::ActionNoise, step);
+                    let mut stream = PhiloxStream::at_step(draw, DrawPurpose::ActionNoise, step);
                     for (entry, channel) in self.acting.iter_mut().zip(channels) {
                         let noise = values.action_noise * (channel.high - channel.low) * stream.normal();
                         *entry = finite(f64::from(*entry) + noise);
@@ -110,8 +110,8 @@ impl ActionPath {
     /// [`Error::Snapshot`] if a number is not valid in an action. After an error, the state of the path is undefined.
     pub(super) fn load(&mut self, values: &DisturbanceValues, saved: &[f64]) -> Result<(), Error> {
         let is_legal = |&number: &f64| match self.space {
-            ActionSpace::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),
-            ActionSpace::Continuous(_) => (number as f32).is_finite(),
+            ActionSpec::Discrete(names) => number.fract() == 0.0 && (0.0..names.len() as f64).contains(&number),
+            ActionSpec::Continuous(_) => (number as f32).is_finite(),
         };
         if let Some(number) = saved.iter().find(|number| !is_legal(number)) {
             return Err(Error::Snapshot { reason: format!("{number} is in one of its late actions") });

@@ -1,7 +1,7 @@
 //! Physics that change within an episode, between two sets of parameters.
 
 use super::parameters::DisturbanceValues;
-use crate::env::{Draw, Environment, Error, Purpose, Stream};
+use crate::env::{Draw, DrawPurpose, Environment, Error, PhiloxStream};
 
 /// An environment whose physics may switch between two sets of parameters: the normal set and the changed set.
 pub(super) struct ChangingPhysics {
@@ -113,7 +113,8 @@ impl ChangingPhysics {
 /// Whether the physics change just before step number `step`, counted from 0. The physics never change before step 0.
 fn begins_with_change(values: &DisturbanceValues, draw: &Draw, step: u32) -> bool {
     let DisturbanceValues { change_at, change_every, change_probability, .. } = *values;
-    let is_drawn =
-        || change_probability > 0.0 && Stream::at_step(draw, Purpose::Change, step).unit() < change_probability;
+    let is_drawn = || {
+        change_probability > 0.0 && PhiloxStream::at_step(draw, DrawPurpose::Change, step).unit() < change_probability
+    };
     step > 0 && (step == change_at || (change_every > 0 && step.is_multiple_of(change_every)) || is_drawn())
 }

@@ -7,7 +7,7 @@ use super::{
     sensors::SensorPath,
 };
 use crate::{
-    env::{Action, Draw, Environment, EnvironmentSpec, Error, Purpose, Stream, Transition},
+    env::{Action, Draw, DrawPurpose, Environment, EnvironmentSpec, Error, PhiloxStream, Transition},
     scene::Scene,
 };
 
@@ -96,7 +96,7 @@ impl Environment for Disturbed {
         self.physics.environment.neutral_action(out);
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.physics.begin();
         self.physics.environment.reset(stream);
         self.begin();
@@ -168,7 +168,7 @@ impl Environment for Disturbed {
 
 /// Draws whether step number `step` has a push. Returns the push's impulse along x, y and z; `None` without a push.
 fn impulse(values: &DisturbanceValues, draw: &Draw, step: u32, axes: &[usize]) -> Option<[f64; 3]> {
-    let mut stream = Stream::at_step(draw, Purpose::Push, step);
+    let mut stream = PhiloxStream::at_step(draw, DrawPurpose::Push, step);
     if stream.unit() * values.push_interval >= 1.0 {
         return None;
     }

@@ -15,7 +15,7 @@ mod layer;
 mod parameters;
 mod sensors;
 
-use super::{Environment, EnvironmentSpec, Error, Parameter, Quantity, shorten};
+use super::{Environment, EnvironmentSpec, Error, ParameterSpec, QuantitySpec, shorten};
 use layer::Disturbed;
 use parameters::DisturbanceSet;
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -26,27 +26,27 @@ use std::sync::{Mutex, OnceLock, PoisonError};
 struct Twin {
     base: &'static EnvironmentSpec,
     disturbed: &'static EnvironmentSpec,
-    disturbances: &'static [Parameter],
+    disturbances: &'static [ParameterSpec],
 }
 
 /// The disturbed twins that were created so far, at most one for each environment.
 static TWINS: Mutex<Vec<Twin>> = Mutex::new(Vec::new());
 
 /// Returns the disturbances that an environment can have in addition to its own parameters.
-pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [Parameter] {
+pub fn disturbances(spec: &'static EnvironmentSpec) -> &'static [ParameterSpec] {
     twin(spec).disturbances
 }
 
 /// Returns all disturbances that suit an environment, as parameters. Leaves out names that the environment itself uses
 /// for a parameter or quantity.
-pub fn possible(spec: &EnvironmentSpec) -> Vec<Parameter> {
+pub fn possible(spec: &EnvironmentSpec) -> Vec<ParameterSpec> {
     DisturbanceSet::new(spec).parameters().collect()
 }
 
 /// Makes an environment whose own parameters include all disturbances. A parameter in `declared` replaces the
 /// disturbance of the same name, so that versions R and E can draw other values than the default. The environment is
 /// its own disturbed twin.
-pub fn declare(spec: &'static EnvironmentSpec, declared: &[Parameter]) -> &'static EnvironmentSpec {
+pub fn declare(spec: &'static EnvironmentSpec, declared: &[ParameterSpec]) -> &'static EnvironmentSpec {
     let mut set = DisturbanceSet::new(spec);
     set.declare(declared);
     let disturbed = with_set(spec, set);
@@ -82,7 +82,7 @@ pub fn with_parameters<'a>(
         }
         let disturbances = disturbances(spec);
         if !disturbances.iter().any(|disturbance| disturbance.name == name) {
-            let list = |parameters: &[Parameter]| parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", ");
+            let list = |parameters: &[ParameterSpec]| parameters.iter().map(|p| p.name).collect::<Vec<_>>().join(", ");
             let known = format!("{}; and the disturbances {}", list(spec.parameters), list(disturbances));
             return Err(Error::UnknownParameter { environment: spec.name, name: shorten(name), known });
         }
@@ -113,7 +113,7 @@ fn twin(spec: &'static EnvironmentSpec) -> Twin {
         return *twin;
     }
     let set = DisturbanceSet::new(spec);
-    let disturbances: &'static [Parameter] = Vec::leak(set.parameters().collect());
+    let disturbances: &'static [ParameterSpec] = Vec::leak(set.parameters().collect());
     let twin = Twin { base: spec, disturbed: with_set(spec, set), disturbances };
     twins.push(twin);
     twin
@@ -122,7 +122,7 @@ fn twin(spec: &'static EnvironmentSpec) -> Twin {
 /// Makes an environment with the disturbances in `set` appended to its own parameters.
 fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static EnvironmentSpec {
     let set: &'static DisturbanceSet = Box::leak(Box::new(set));
-    let quantities = set.parameters().map(|Parameter { name, unit, .. }| Quantity { name, unit });
+    let quantities = set.parameters().map(|ParameterSpec { name, unit, .. }| QuantitySpec { name, unit });
     let mut disturbed = *spec;
     disturbed.parameters = Vec::leak(spec.parameters.iter().copied().chain(set.parameters()).collect());
     disturbed.applied = Vec::leak(spec.applied.iter().copied().chain(quantities).collect());

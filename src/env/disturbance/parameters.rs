@@ -1,6 +1,6 @@
 //! The disturbances of an environment as parameters, and their current values.
 
-use crate::env::{ActionSpace, EnvironmentSpec, Parameter};
+use crate::env::{ActionSpec, EnvironmentSpec, ParameterSpec};
 use perturb_protocol::disturbance::{CHANGED, DEFAULT_PUSH_INTERVAL};
 
 /// Maximal delay of actions or observations, in steps.
@@ -46,7 +46,7 @@ pub(super) enum DisturbanceKind {
 
 /// The disturbances of one environment.
 pub(super) struct DisturbanceSet {
-    entries: Vec<(DisturbanceKind, Parameter)>,
+    entries: Vec<(DisturbanceKind, ParameterSpec)>,
     /// A, the number of entries of a continuous action; 1 if actions are discrete.
     pub(super) action_width: usize,
 }
@@ -85,24 +85,25 @@ impl DisturbanceValues {
 /// Returns the disturbances that change the physics within an episode. For each parameter `x` of the environment there
 /// is a disturbance `changed_x`, the value of `x` after a change. Each version draws it from the same distribution as
 /// `x`.
-fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, Parameter)> {
+fn changes(spec: &EnvironmentSpec) -> Vec<(DisturbanceKind, ParameterSpec)> {
     if spec.parameters.is_empty() {
         return Vec::new();
     }
-    let steps = |name, description| Parameter::new(name, "1", description, (0.0, MAX_CHANGE_STEPS)).off(0.0).integer();
+    let steps =
+        |name, description| ParameterSpec::new(name, "1", description, (0.0, MAX_CHANGE_STEPS)).off(0.0).integer();
     let probability = "probability that the physics change between two steps";
     let mut entries = vec![
         (DisturbanceKind::ChangeAt, steps("change_at", "number of steps after which the physics change; 0: never")),
         (DisturbanceKind::ChangeEvery, steps("change_every", "number of steps between changes; 0: never")),
         (
             DisturbanceKind::ChangeProbability,
-            Parameter::new("change_probability", "1", probability, (0.0, 1.0)).off(0.0),
+            ParameterSpec::new("change_probability", "1", probability, (0.0, 1.0)).off(0.0),
         ),
     ];
     entries.extend(spec.parameters.iter().enumerate().map(|(place, parameter)| {
         let name: &'static str = String::leak(format!("{CHANGED}{}", parameter.name));
         let description: &'static str = String::leak(format!("{} after a change", parameter.description));
-        (DisturbanceKind::Changed(place), Parameter { name, description, applied: name, ..*parameter })
+        (DisturbanceKind::Changed(place), ParameterSpec { name, description, applied: name, ..*parameter })
     }));
     entries
 }
@@ -111,11 +112,11 @@ impl DisturbanceSet {
     /// Returns the disturbances of an environment. Leaves out names that the environment itself uses for a parameter or
     /// quantity.
     pub(super) fn new(spec: &EnvironmentSpec) -> Self {
-        let share = |name, description, most| Parameter::new(name, "1", description, (0.0, most));
+        let share = |name, description, most| ParameterSpec::new(name, "1", description, (0.0, most));
         let steps = |name, description, most: usize| share(name, description, most as f64).off(0.0).integer();
         let (action_width, actuators) = match spec.action {
-            ActionSpace::Discrete(_) => (1, None),
-            ActionSpace::Continuous(channels) => (channels.len(), Some(channels)),
+            ActionSpec::Discrete(_) => (1, None),
+            ActionSpec::Continuous(channels) => (channels.len(), Some(channels)),
         };
         let most_delay = |numbers: usize, width: usize| MAX_DELAY.min(numbers / width.max(1)).max(1);
         let mut entries = vec![
@@ -146,9 +147,9 @@ impl DisturbanceSet {
             entries.extend(own.filter(|_| channels.len() > 1));
         }
         if let Some(push) = spec.push {
-            let size = Parameter::new("push", push.unit, push.description, (0.0, MAX_PUSH)).off(0.0);
+            let size = ParameterSpec::new("push", push.unit, push.description, (0.0, MAX_PUSH)).off(0.0);
             let bounds = (1.0, MAX_PUSH_INTERVAL);
-            let interval = Parameter::new("push_interval", "1", "mean number of steps between pushes", bounds);
+            let interval = ParameterSpec::new("push_interval", "1", "mean number of steps between pushes", bounds);
             entries.extend([
                 (DisturbanceKind::Push, size),
                 (DisturbanceKind::PushInterval, interval.off(DEFAULT_PUSH_INTERVAL)),
@@ -183,7 +184,7 @@ impl DisturbanceSet {
 
     /// Replaces disturbances by the parameters of the same name in `declared`, whose distributions for R and E may
     /// differ.
-    pub(super) fn declare(&mut self, declared: &[Parameter]) {
+    pub(super) fn declare(&mut self, declared: &[ParameterSpec]) {
         for (_, parameter) in &mut self.entries {
             if let Some(own) = declared.iter().find(|own| own.name == parameter.name) {
                 *parameter = *own;
@@ -192,7 +193,7 @@ impl DisturbanceSet {
     }
 
     /// The disturbances as parameters, in order.
-    pub(super) fn parameters(&self) -> impl Iterator<Item = Parameter> + '_ {
+    pub(super) fn parameters(&self) -> impl Iterator<Item = ParameterSpec> + '_ {
         self.entries.iter().map(|(_, parameter)| *parameter)
     }
 

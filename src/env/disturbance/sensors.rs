@@ -1,11 +1,11 @@
 //! Disturbs observations: delay, noise and dropout.
 
 use super::{next_place, parameters::DisturbanceValues};
-use crate::env::{Channel, Draw, Error, Purpose, Stream};
+use crate::env::{ChannelSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
 pub(super) struct SensorPath {
-    channels: &'static [Channel],
+    channels: &'static [ChannelSpec],
     /// A ring buffer of exact observations, `[sensor_delay + 1, O]`: the policy sees the oldest observation now, with
     /// noise and dropout; the newer observations are still delayed.
     exact: Vec<f32>,
@@ -17,7 +17,7 @@ pub(super) struct SensorPath {
 
 impl SensorPath {
     /// Creates the path for observations whose entries are `channels`.
-    pub(super) fn new(channels: &'static [Channel]) -> Self {
+    pub(super) fn new(channels: &'static [ChannelSpec]) -> Self {
         Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
     }
 
@@ -60,7 +60,7 @@ impl SensorPath {
         let oldest = next_place(self.newest, width, self.exact.len());
         self.seen.copy_from_slice(&self.exact[oldest..][..width]);
         if values.sensor_noise > 0.0 {
-            let mut stream = Stream::at_step(draw, Purpose::SensorNoise, steps);
+            let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorNoise, steps);
             for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
                 let normal = stream.normal();
                 if channel.scale > 0.0 {
@@ -71,7 +71,7 @@ impl SensorPath {
             }
         }
         if values.sensor_dropout > 0.0 {
-            let mut stream = Stream::at_step(draw, Purpose::SensorDropout, steps);
+            let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorDropout, steps);
             for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
                 let is_lost = stream.unit() < values.sensor_dropout;
                 if is_lost && channel.scale > 0.0 {

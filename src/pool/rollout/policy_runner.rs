@@ -1,7 +1,7 @@
 //! A policy that chooses the actions of a batch on the server.
 
 use crate::{
-    env::EpisodeEnd,
+    env::FinishedEpisode,
     pool::{
         Error,
         shard::{Shard, set_actions},
@@ -9,7 +9,8 @@ use crate::{
     },
 };
 use perturb_policy::{
-    CollectUntil, Inputs, Normalisers, Player, PlayerState, PolicySpec, RemainingRollout, Role, SlotEnd, StepOutcome,
+    CollectUntil, Inputs, Normalisers, Player, PlayerRole, PlayerTrainingState, PolicySpec, RemainingRollout, SlotEnd,
+    StepOutcome,
 };
 use rand_chacha::ChaCha8Rng;
 use std::sync::Mutex;
@@ -17,7 +18,7 @@ use std::sync::Mutex;
 /// A policy as a client sent it, before its first step. The session has checked that the fields fit each other and the
 /// batch.
 #[derive(Debug, Clone)]
-pub struct Policy {
+pub struct ReceivedPolicy {
     /// The layer sizes of the networks.
     pub spec: PolicySpec,
     /// The builder of the networks' inputs, in its initial state.
@@ -27,7 +28,7 @@ pub struct Policy {
     /// Whether the policy is trained or tested, with the random stream of its actions.
     pub role: PolicyRole,
     /// The saved state from which a training continues. If `None`, a trial begins in every environment.
-    pub state: Option<PlayerState>,
+    pub state: Option<PlayerTrainingState>,
     /// All weights of the networks, `[P]`, finite.
     pub weights: Vec<f32>,
     /// The number of episodes in a trial.
@@ -70,20 +71,20 @@ pub(in crate::pool) struct StepBuffers {
     final_observations: Vec<f32>,
     ended: Vec<SlotEnd>,
     /// The episodes that ended in the step, each with its slot.
-    pub(in crate::pool) ends: Vec<(u32, EpisodeEnd)>,
+    pub(in crate::pool) ends: Vec<(u32, FinishedEpisode)>,
 }
 
 impl PolicyRunner {
     /// Starts a policy in the environments of `shards`. The policy continues from its saved state. Without a saved
     /// state, each environment begins a trial.
-    pub(in crate::pool) fn begin(policy: Policy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
-        let Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
+    pub(in crate::pool) fn begin(policy: ReceivedPolicy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
+        let ReceivedPolicy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =
             shards.iter().flat_map(|shard| lock(shard).trials().collect::<Vec<_>>()).collect();
         let n_envs = trials.len();
         let (role, seed) = match role {
-            PolicyRole::Training(stream) => (Role::Training(stream), None),
-            PolicyRole::Testing { seed } => (Role::testing_in(seed, trials.into_iter()), Some(seed)),
+            PolicyRole::Training(stream) => (PlayerRole::Training(stream), None),
+            PolicyRole::Testing { seed } => (PlayerRole::testing_in(seed, trials.into_iter()), Some(seed)),
         };
         let player = Player::new(&spec, inputs, n_envs, episodes_per_trial, normalisers, role);
         let mut runner = Self { player, task: RemainingRollout::Steps(0), seed, step: StepBuffers::default(), spec };

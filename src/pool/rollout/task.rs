@@ -5,9 +5,9 @@
 //! shards. Then the job goes to the back of the queue, as after any other step. The session is woken at the end of the
 //! rollout.
 
-use super::policy_runner::{Policy, PolicyRunner};
+use super::policy_runner::{PolicyRunner, ReceivedPolicy};
 use crate::{
-    env::EpisodeEnd,
+    env::FinishedEpisode,
     pool::{
         Error,
         encode::{push_f32, push_flags},
@@ -30,7 +30,7 @@ const INITIAL_CAPACITY_STEPS: usize = 256;
 #[derive(Debug, Clone)]
 pub struct RolloutRequest {
     /// The policy to play; if `None`, the previous policy continues.
-    pub policy: Option<Policy>,
+    pub policy: Option<ReceivedPolicy>,
     /// New weights for the previous policy, `[P]`, finite; if `None`, the policy keeps its weights.
     pub weights: Option<Vec<f32>>,
     /// The task to start: the steps or episodes that the policy has to play. If `None`, the previous task continues.
@@ -67,7 +67,7 @@ pub struct Rollout {
     pub truncation_values: BytesMut,
     /// The episodes that ended, ordered by step, then by slot. If the task is a number of episodes per environment,
     /// episodes beyond this number are left out.
-    pub ended: Vec<EndedAt>,
+    pub ended: Vec<RolloutEpisodeEnd>,
     /// Whether the policy's task was finished in this rollout.
     pub finished: bool,
     /// The values V of the observations after the last step, f32 `[N]`; empty unless the task is finished.
@@ -81,13 +81,13 @@ pub struct Rollout {
 
 /// An episode that ended during a rollout.
 #[derive(Debug, Clone, PartialEq)]
-pub struct EndedAt {
+pub struct RolloutEpisodeEnd {
     /// The number of the step in which the episode ended, counted from 0 at the start of the rollout.
     pub step: usize,
     /// The slot of the environment.
     pub slot: u32,
     /// The facts about the ended episode.
-    pub end: EpisodeEnd,
+    pub end: FinishedEpisode,
     /// Whether the environment's task ended the episode.
     pub terminated: bool,
     /// Whether the step limit ended the episode.
@@ -221,7 +221,7 @@ impl Rollout {
         for (slot, end) in step.ends.drain(..).filter(|(slot, _)| task.counts(*slot as usize)) {
             self.ended_bytes += end_bytes(&end);
             let (terminated, truncated) = (step.terminated[slot as usize], step.truncated[slot as usize]);
-            self.ended.push(EndedAt { step: self.steps, slot, end, terminated, truncated });
+            self.ended.push(RolloutEpisodeEnd { step: self.steps, slot, end, terminated, truncated });
         }
         self.steps += 1;
     }
@@ -247,7 +247,7 @@ impl Rollout {
 }
 
 /// The estimated encoded length of an episode's end, bytes.
-fn end_bytes(end: &EpisodeEnd) -> usize {
+fn end_bytes(end: &FinishedEpisode) -> usize {
     let receipt = end.receipt.as_ref();
     EPISODE_END_BYTES + receipt.map_or(0, |r| 8 * (r.requested.len() + r.applied.len()) + r.model_hash.len())
 }

@@ -3,7 +3,7 @@
 use super::Tokens;
 use crate::server::{
     error::{ErrorCounters, RequestError, status},
-    net::managed_io::Connection,
+    net::managed_io::ConnectionHandle,
 };
 use std::{
     convert::Infallible,
@@ -76,7 +76,7 @@ where
                 Box::pin(self.service.call(request))
             }
             Err(error) => {
-                let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
+                let peer = request.extensions().get::<ConnectionHandle>().map(|connection| connection.peer);
                 tracing::debug!(?peer, path = request.uri().path(), refusal = %error, "refused a call");
                 self.counters.count(error.kind());
                 Box::pin(ready(Ok(status(&error).into_http())))

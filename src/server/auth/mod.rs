@@ -11,10 +11,10 @@ mod token_file;
 pub use error::Error;
 pub use layer::{AuthLayer, AuthService};
 pub use quota::QuotaGuard;
-pub use role::Role;
+pub use role::TokenRole;
 pub use token_file::{TokenFileError, new_token};
 
-use super::net::{managed_io::Connection, peer_limiter::Peer};
+use super::net::{managed_io::ConnectionHandle, peer_limiter::Peer};
 use crate::env::Catalogue;
 use quota::{Quota, QuotaKind};
 use rate_limiter::{MAX_WAIT, RateLimiter, TooFast};
@@ -36,7 +36,7 @@ pub struct Token {
     name: String,
     /// The SHA-256 digest of the secret text.
     digest: [u8; 32],
-    role: Option<Arc<Role>>,
+    role: Option<Arc<TokenRole>>,
     revoked: AtomicBool,
     /// Wakes the tasks that wait in [`Token::revoked`].
     revoked_notify: Notify,
@@ -134,7 +134,7 @@ impl Token {
     }
 
     /// The role, which limits the distributions that the token's sessions may draw from; `None` for no limit.
-    pub fn role(&self) -> Option<&Role> {
+    pub fn role(&self) -> Option<&TokenRole> {
         self.role.as_deref()
     }
 
@@ -260,7 +260,7 @@ impl Tokens {
     /// # Errors
     /// [`Error::NoToken`] if the call has no token, [`Error::WrongToken`] if its token is unknown.
     fn authenticate(&self, request: &http::Request<Body>) -> Result<Option<Bearer>, Error> {
-        let peer = request.extensions().get::<Connection>().map(|connection| connection.peer);
+        let peer = request.extensions().get::<ConnectionHandle>().map(|connection| connection.peer);
         if matches!(peer, Some(Peer::User(_))) {
             return Ok(None);
         }

@@ -6,7 +6,7 @@ use std::fmt;
 
 /// A role of tokens. A role limits the parameter values that the tokens' sessions may draw.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Role {
+pub struct TokenRole {
     pub(super) name: String,
     /// A session may only draw from within the union of these sets; `None` for anywhere.
     pub(super) draws: Option<Vec<DrawSet>>,
@@ -43,7 +43,7 @@ impl fmt::Display for DrawSet {
     }
 }
 
-impl Role {
+impl TokenRole {
     /// The role's name.
     pub fn name(&self) -> &str {
         &self.name

@@ -1,6 +1,6 @@
 //! Parses and checks the token file.
 
-use super::role::{DrawSet, Role};
+use super::role::{DrawSet, TokenRole};
 use crate::env::{Catalogue, Distribution, Version, disturbance, resolve};
 use serde::Deserialize;
 use sha2::{Digest, Sha256};
@@ -75,7 +75,7 @@ pub(super) struct ParsedToken {
     /// The SHA-256 digest of the token.
     pub(super) digest: [u8; 32],
     pub(super) entry: TokenEntry,
-    pub(super) role: Option<Arc<Role>>,
+    pub(super) role: Option<Arc<TokenRole>>,
 }
 
 /// Parses and checks a token file. The file's parameter sets may refer to the environments of `catalogue`.
@@ -104,7 +104,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
         }
     }
     // Roles, which tokens refer to.
-    let mut known_roles: BTreeMap<String, Arc<Role>> = BTreeMap::new();
+    let mut known_roles: BTreeMap<String, Arc<TokenRole>> = BTreeMap::new();
     for role in roles {
         let line = line(role.span().start);
         let RoleEntry { name, draws, never } = role.into_inner();
@@ -122,7 +122,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
                 ),
             });
         }
-        if known_roles.insert(name.clone(), Arc::new(Role { name: name.clone(), draws, never })).is_some() {
+        if known_roles.insert(name.clone(), Arc::new(TokenRole { name: name.clone(), draws, never })).is_some() {
             return Err(TokenFileError { line, what: format!("there are two roles called {name:?}") });
         }
     }

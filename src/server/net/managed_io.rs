@@ -28,7 +28,7 @@ const PREFACE_BYTES: usize = 24;
 
 /// A handle to a connection, for the calls that it carries.
 #[derive(Clone)]
-pub struct Connection {
+pub struct ConnectionHandle {
     /// The peer of the connection.
     pub peer: Peer,
     kill_switch: Arc<KillSwitch>,
@@ -40,7 +40,7 @@ struct KillSwitch {
     waker: AtomicWaker,
 }
 
-impl Connection {
+impl ConnectionHandle {
     /// Closes the connection, which ends all its calls.
     pub fn close(&self) {
         self.kill_switch.requested.store(true, Ordering::Release);
@@ -49,10 +49,10 @@ impl Connection {
 }
 
 /// The I/O of a connection. It fails if the client's HTTP/2 preface does not arrive in time, and after
-/// [`Connection::close`].
+/// [`ConnectionHandle::close`].
 pub struct ManagedIo<S> {
     stream: S,
-    connection: Connection,
+    connection: ConnectionHandle,
     /// The number of bytes of the preface that have not arrived yet, and the timer of their deadline. `None` once the
     /// preface has arrived.
     preface: Option<(usize, Pin<Box<Sleep>>)>,
@@ -66,7 +66,7 @@ impl<S> ManagedIo<S> {
         let preface = Some((PREFACE_BYTES, Box::pin(sleep(limit))));
         Self {
             stream,
-            connection: Connection { peer, kill_switch: Arc::default() },
+            connection: ConnectionHandle { peer, kill_switch: Arc::default() },
             preface,
             _permit: permit,
             load: None,
@@ -94,16 +94,16 @@ impl<S> ManagedIo<S> {
 }
 
 impl<S> Drop for ManagedIo<S> {
-    /// Drops the waker. Otherwise every call's [`Connection`] would keep the memory of this connection alive.
+    /// Drops the waker. Otherwise every call's [`ConnectionHandle`] would keep the memory of this connection alive.
     fn drop(&mut self) {
         self.connection.kill_switch.waker.take();
     }
 }
 
 impl<S> Connected for ManagedIo<S> {
-    type ConnectInfo = Connection;
+    type ConnectInfo = ConnectionHandle;
 
-    fn connect_info(&self) -> Connection {
+    fn connect_info(&self) -> ConnectionHandle {
         self.connection.clone()
     }
 }

@@ -9,7 +9,7 @@ use super::{
     budget::{Budget, MemoryReservation, PendingReservations},
     compression::Compression,
 };
-use crate::server::{auth::Bearer, limits::RequestLimits, net::managed_io::Connection};
+use crate::server::{auth::Bearer, limits::RequestLimits, net::managed_io::ConnectionHandle};
 use bytes::{Buf, Bytes, BytesMut};
 use http_body::Body as _;
 use http_body_util::BodyExt;
@@ -57,7 +57,7 @@ pub struct MessageReader {
     reservation: MemoryReservation,
     stream_limits: StreamLimits,
     /// The connection of the stream, if it is known.
-    pub connection: Option<Connection>,
+    pub connection: Option<ConnectionHandle>,
     /// The token of the call; `None` if the server requires none.
     pub bearer: Option<Bearer>,
     /// The queue for memory reservations of the stream's replies.
@@ -116,7 +116,7 @@ impl MessageReader {
         body: Body,
         compression: Option<Compression>,
         stream_limits: StreamLimits,
-        connection: Option<Connection>,
+        connection: Option<ConnectionHandle>,
         bearer: Option<Bearer>,
         outbox: PendingReservations,
     ) -> Self {

@@ -7,7 +7,7 @@ use super::{
     message_reader::{MessageReader, StreamLimits},
     watched_body::{ReadTimeouts, WatchedBody},
 };
-use crate::server::{auth::Bearer, net::managed_io::Connection};
+use crate::server::{auth::Bearer, net::managed_io::ConnectionHandle};
 use std::{
     convert::Infallible,
     future::Future,
@@ -79,7 +79,7 @@ where
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
         let outbox = PendingReservations::default();
-        let connection = request.extensions().get::<Connection>().cloned();
+        let connection = request.extensions().get::<ConnectionHandle>().cloned();
         let is_stream = request.uri().path() == self.path;
         // Unary calls have one small reply, which needs no timeout.
         let timeouts =

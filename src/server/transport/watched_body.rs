@@ -2,7 +2,7 @@
 //! connection of a client that does not read.
 
 use super::budget::PendingReservations;
-use crate::server::net::managed_io::Connection;
+use crate::server::net::managed_io::ConnectionHandle;
 use bytes::Bytes;
 use http_body::{Body as HttpBody, Frame, SizeHint};
 use std::{
@@ -126,7 +126,7 @@ impl WatchedBody {
     pub fn new(
         body: Body,
         outbox: PendingReservations,
-        connection: Option<Connection>,
+        connection: Option<ConnectionHandle>,
         timeouts: Option<ReadTimeouts>,
     ) -> Self {
         let progress = Arc::new(ReadProgress { state: Mutex::new(ProgressState::new()), watch: OnceLock::new() });
@@ -139,7 +139,7 @@ impl WatchedBody {
 }
 
 /// Closes the connection when its client has exceeded a read timeout.
-async fn watch(progress: Weak<ReadProgress>, connection: Connection, timeouts: ReadTimeouts) {
+async fn watch(progress: Weak<ReadProgress>, connection: ConnectionHandle, timeouts: ReadTimeouts) {
     let mut limit = Some(timeouts.rest.map_or(timeouts.first, |rest| rest.min(timeouts.first)));
     while let Some(timeout) = limit {
         sleep(timeout / CHECKS_PER_TIMEOUT).await;

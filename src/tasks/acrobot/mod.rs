@@ -8,8 +8,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream,
+        PushSpec, QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::Scene,
 };
@@ -22,49 +22,56 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Swing the tip of a two-link pendulum above a line.",
     make: &|| Ok(Box::new(Acrobot::new())),
     parameters: &[
-        Parameter::new("length", "m", "length of both links", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
-        Parameter::new("mass", "kg", "mass of both links", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
-        Parameter::new("moi", "kg m²", "moment of inertia of both links", (0.001, 1000.0)).versions(
+        ParameterSpec::new("length", "m", "length of both links", (0.01, 100.0)).versions(
+            1.0,
+            (0.75, 1.25),
+            (0.5, 1.5),
+        ),
+        ParameterSpec::new("mass", "kg", "mass of both links", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        ParameterSpec::new("moi", "kg m²", "moment of inertia of both links", (0.001, 1000.0)).versions(
             1.0,
             (0.75, 1.25),
             (0.5, 1.5),
         ),
     ],
     observation: &[
-        Channel::new("cos_theta1", "1", -1.0, 1.0),
-        Channel::new("sin_theta1", "1", -1.0, 1.0),
-        Channel::new("cos_theta2", "1", -1.0, 1.0),
-        Channel::new("sin_theta2", "1", -1.0, 1.0),
-        Channel::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
-        Channel::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
+        ChannelSpec::new("cos_theta1", "1", -1.0, 1.0),
+        ChannelSpec::new("sin_theta1", "1", -1.0, 1.0),
+        ChannelSpec::new("cos_theta2", "1", -1.0, 1.0),
+        ChannelSpec::new("sin_theta2", "1", -1.0, 1.0),
+        ChannelSpec::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
+        ChannelSpec::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
     ],
-    action: ActionSpace::Discrete(&["torque_minus_1", "torque_0", "torque_plus_1"]),
+    action: ActionSpec::Discrete(&["torque_minus_1", "torque_0", "torque_plus_1"]),
     state: &[
-        Channel::new("theta1", "rad", -PI, PI),
-        Channel::new("theta2", "rad", -PI, PI),
-        Channel::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
-        Channel::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
+        ChannelSpec::new("theta1", "rad", -PI, PI),
+        ChannelSpec::new("theta2", "rad", -PI, PI),
+        ChannelSpec::new("theta1_velocity", "rad/s", -MAX_VELOCITY_1, MAX_VELOCITY_1),
+        ChannelSpec::new("theta2_velocity", "rad/s", -MAX_VELOCITY_2, MAX_VELOCITY_2),
     ],
-    reward_terms: &[RewardTerm { name: "time", description: "-1 for every step, 0 for the one that ends the task" }],
+    reward_terms: &[RewardTermSpec {
+        name: "time",
+        description: "-1 for every step, 0 for the one that ends the task",
+    }],
     applied: &[
-        Quantity { name: "length", unit: "m" },
-        Quantity { name: "mass", unit: "kg" },
-        Quantity { name: "moi", unit: "kg m²" },
+        QuantitySpec { name: "length", unit: "m" },
+        QuantitySpec { name: "mass", unit: "kg" },
+        QuantitySpec { name: "moi", unit: "kg m²" },
     ],
     step_limit: 500,
     control_timestep: DT,
     step_cost: 0.3,
     push: Some(PushSpec { description: "impulse of a push on the first joint", unit: "N m s", axes: &[0] }),
-    success: Success {
+    success: SuccessRuleSpec {
         description: "the height was reached within 80 steps",
         achievement: Achievement::FirstGoal,
-        comparison: Comparison::AtMost,
+        comparison: SuccessComparison::AtMost,
         threshold: 80.0,
     },
-    code_success: Some(Success {
+    code_success: Some(SuccessRuleSpec {
         description: "the height was reached within 90 steps",
         achievement: Achievement::FirstGoal,
-        comparison: Comparison::AtMost,
+        comparison: SuccessComparison::AtMost,
         threshold: 90.0,
     }),
     heatmap_axes: Some(["length", "mass"]),
@@ -169,7 +176,7 @@ impl Environment for Acrobot {
         self.push = impulse;
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
 

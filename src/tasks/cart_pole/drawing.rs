@@ -2,10 +2,10 @@
 //! fallen.
 
 use super::{ANGLE_LIMIT, POSITION_LIMIT};
-use crate::scene::{Drawing, Point, colour, polar};
+use crate::scene::{Drawing, ScenePoint, colour, polar};
 use std::f64::consts::FRAC_PI_2;
 
-const CART: Point = [0.25, 0.22]; // half width, height
+const CART: ScenePoint = [0.25, 0.22]; // half width, height
 const WHEEL: f64 = 0.07;
 const POLE: f64 = 0.09;
 

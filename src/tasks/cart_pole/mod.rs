@@ -7,8 +7,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream,
+        PushSpec, QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::Scene,
 };
@@ -21,51 +21,51 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Balance a pole on a cart by pushing the cart left or right.",
     make: &|| Ok(Box::new(CartPole::new())),
     parameters: &[
-        Parameter::new("force", "N", "push on the cart", (0.0, 1000.0)).versions(10.0, (5.0, 15.0), (1.0, 20.0)),
-        Parameter::new("length", "m", "half the pole's length", (0.001, 100.0)).versions(
+        ParameterSpec::new("force", "N", "push on the cart", (0.0, 1000.0)).versions(10.0, (5.0, 15.0), (1.0, 20.0)),
+        ParameterSpec::new("length", "m", "half the pole's length", (0.001, 100.0)).versions(
             0.5,
             (0.25, 0.75),
             (0.05, 1.0),
         ),
-        Parameter::new("mass", "kg", "the pole's mass", (0.0001, 1000.0)).versions(0.1, (0.05, 0.5), (0.01, 1.0)),
+        ParameterSpec::new("mass", "kg", "the pole's mass", (0.0001, 1000.0)).versions(0.1, (0.05, 0.5), (0.01, 1.0)),
     ],
     observation: &[
-        Channel::unbounded("cart_position", "m").scale(POSITION_LIMIT),
-        Channel::unbounded("cart_velocity", "m/s"),
-        Channel::unbounded("pole_angle", "rad").scale(ANGLE_LIMIT),
-        Channel::unbounded("pole_angular_velocity", "rad/s"),
+        ChannelSpec::unbounded("cart_position", "m").scale(POSITION_LIMIT),
+        ChannelSpec::unbounded("cart_velocity", "m/s"),
+        ChannelSpec::unbounded("pole_angle", "rad").scale(ANGLE_LIMIT),
+        ChannelSpec::unbounded("pole_angular_velocity", "rad/s"),
     ],
-    action: ActionSpace::Discrete(&["push_left", "push_right"]),
+    action: ActionSpec::Discrete(&["push_left", "push_right"]),
     state: &[
-        Channel::new("cart_position", "m", -POSITION_LIMIT, POSITION_LIMIT),
-        Channel::new("cart_velocity", "m/s", -100.0, 100.0),
-        Channel::new("pole_angle", "rad", -ANGLE_LIMIT, ANGLE_LIMIT),
-        Channel::new("pole_angular_velocity", "rad/s", -100.0, 100.0),
+        ChannelSpec::new("cart_position", "m", -POSITION_LIMIT, POSITION_LIMIT),
+        ChannelSpec::new("cart_velocity", "m/s", -100.0, 100.0),
+        ChannelSpec::new("pole_angle", "rad", -ANGLE_LIMIT, ANGLE_LIMIT),
+        ChannelSpec::new("pole_angular_velocity", "rad/s", -100.0, 100.0),
     ],
-    reward_terms: &[RewardTerm { name: "survival", description: "1 for every step, the last included" }],
+    reward_terms: &[RewardTermSpec { name: "survival", description: "1 for every step, the last included" }],
     applied: &[
-        Quantity { name: "force", unit: "N" },
-        Quantity { name: "length", unit: "m" },
-        Quantity { name: "mass", unit: "kg" },
-        Quantity { name: "total_mass", unit: "kg" },
-        Quantity { name: "pole_mass_length", unit: "kg m" },
+        QuantitySpec { name: "force", unit: "N" },
+        QuantitySpec { name: "length", unit: "m" },
+        QuantitySpec { name: "mass", unit: "kg" },
+        QuantitySpec { name: "total_mass", unit: "kg" },
+        QuantitySpec { name: "pole_mass_length", unit: "kg m" },
     ],
     step_limit: 200,
     control_timestep: TAU,
     step_cost: 0.04,
     push: Some(PushSpec { description: "impulse of a push on the cart", unit: "N s", axes: &[0] }),
-    success: Success {
+    success: SuccessRuleSpec {
         description: "the episode lasted at least 195 steps",
         achievement: Achievement::Length,
-        comparison: Comparison::AtLeast,
+        comparison: SuccessComparison::AtLeast,
         threshold: 195.0,
     },
     // The paper's code compares the length with 195 after each step. That code resets an ended environment before the
     // comparison, so the step that ends the episode does not count.
-    code_success: Some(Success {
+    code_success: Some(SuccessRuleSpec {
         description: "the episode lasted at least 196 steps",
         achievement: Achievement::Length,
-        comparison: Comparison::AtLeast,
+        comparison: SuccessComparison::AtLeast,
         threshold: 196.0,
     }),
     heatmap_axes: Some(["length", "mass"]),
@@ -139,7 +139,7 @@ impl Environment for CartPole {
         self.push = impulse;
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.state = analytic::draw(stream, -RESET_RANGE, RESET_RANGE);
     }
 

@@ -3,11 +3,11 @@
 use super::{
     elements::Elements,
     error::{Result, escaped},
-    parameter::{Edit, EditedParameter},
-    table::Table,
+    parameter::{EditedParameter, ParameterEdit},
+    table::TomlTable,
     target::{Change, is_limited, without_effect},
 };
-use perturb_mujoco::{Field, Index, Kind, Model, Options};
+use perturb_mujoco::{ElementKind, Index, Model, ModelField, Options};
 
 /// Minimal dimension (`condim`) of a contact with torsional friction.
 const TORSION_DIMENSION: i32 = 4;
@@ -19,7 +19,7 @@ const ROLL_DIMENSION: i32 = 6;
 /// # Errors
 /// [`super::Error`] with the parameter and the reason, if an edit cannot change the physics.
 pub(super) fn check(
-    tables: &[Table<'_>],
+    tables: &[TomlTable<'_>],
     parameters: &[EditedParameter],
     model: &Model,
     elements: &Elements,
@@ -49,7 +49,7 @@ pub(super) fn check(
 }
 
 /// Refuses a parameter that edits a number of the model twice, or a number that an earlier parameter edits.
-fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[EditedParameter]) -> Result<()> {
+fn same_number(table: &TomlTable<'_>, parameter: &EditedParameter, earlier: &[EditedParameter]) -> Result<()> {
     let mut seen = std::collections::HashMap::new();
     for other in earlier {
         seen.extend(other.places().map(|place| (place, other.parameter.name)));
@@ -71,7 +71,7 @@ fn same_number(table: &Table<'_>, parameter: &EditedParameter, earlier: &[Edited
 }
 
 /// Refuses edits of a part of the physics, such as contacts, if the model's flags switch this part off.
-fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
+fn switched_off(table: &TomlTable<'_>, edit: &ParameterEdit, model: &Model) -> Result<()> {
     let flags = model.options().disable_flags;
     let (bits, what) = match (edit.targets.subject, edit.targets.field) {
         ("geom" | "pair", _) => (Options::DISABLE_CONTACT | Options::DISABLE_CONSTRAINT, "contacts"),
@@ -90,7 +90,7 @@ fn switched_off(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
 }
 
 /// Refuses edits of the range of a joint or actuator that has no limits.
-fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
+fn limits(table: &TomlTable<'_>, edit: &ParameterEdit, model: &Model) -> Result<()> {
     let free = edit.targets.ids.iter().zip(&edit.targets.names);
     let mut free = free.filter(|(id, _)| !is_limited(model, edit.targets.subject, **id));
     match free.next() {
@@ -104,10 +104,12 @@ fn limits(table: &Table<'_>, edit: &Edit, model: &Model) -> Result<()> {
 }
 
 /// Refuses edits of the wind if the model has no air: density and viscosity are 0 and no parameter edits them.
-fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Result<()> {
-    let is_edited = |field: Field| parameters.iter().any(|other| other.places().any(|(edited, _)| edited == field));
-    let has_medium =
-        [Field::Density, Field::Viscosity].into_iter().any(|field| model.field(field)[0] > 0.0 || is_edited(field));
+fn wind(table: &TomlTable<'_>, parameters: &[EditedParameter], model: &Model) -> Result<()> {
+    let is_edited =
+        |field: ModelField| parameters.iter().any(|other| other.places().any(|(edited, _)| edited == field));
+    let has_medium = [ModelField::Density, ModelField::Viscosity]
+        .into_iter()
+        .any(|field| model.field(field)[0] > 0.0 || is_edited(field));
     if has_medium {
         return Ok(());
     }
@@ -116,8 +118,8 @@ fn wind(table: &Table<'_>, parameters: &[EditedParameter], model: &Model) -> Res
 
 /// Refuses edits of a geom's friction that no contact would use, for all or some of the parameter's values.
 fn friction(
-    table: &Table<'_>,
-    edit: &Edit,
+    table: &TomlTable<'_>,
+    edit: &ParameterEdit,
     (parameter, parameters): (&EditedParameter, &[EditedParameter]),
     model: &Model,
     elements: &Elements,
@@ -128,7 +130,7 @@ fn friction(
     let contacts: Vec<Contact> = geoms.iter().flat_map(|&geom| contacts_of(model, geom)).collect();
     if contacts.is_empty() {
         let name = escaped(edit.targets.names.first().map_or("", String::as_str));
-        let why = if model.options().collision == 1 || model.count(Kind::Pair) > 0 {
+        let why = if model.options().collision == 1 || model.count(ElementKind::Pair) > 0 {
             "only declared pairs of it can touch, which have a friction of their own; edit the pairs"
         } else {
             "it can touch nothing; see its contype and conaffinity"
@@ -153,7 +155,7 @@ fn friction(
     let edited: Vec<usize> = parameters
         .iter()
         .flat_map(EditedParameter::places)
-        .filter(|(array, _)| *array == Field::GeomFriction)
+        .filter(|(array, _)| *array == ModelField::GeomFriction)
         .map(|(_, at)| at)
         .collect();
     let column =
@@ -165,7 +167,7 @@ fn friction(
         if contact.other_has_priority {
             f64::INFINITY
         } else {
-            model.field(Field::GeomFriction)[3 * contact.other + column]
+            model.field(ModelField::GeomFriction)[3 * contact.other + column]
         }
     };
     // MuJoCo uses the larger friction of two touching geoms, so an edited friction below the other geom's has no
@@ -182,7 +184,8 @@ fn friction(
     if least >= limit {
         return Ok(());
     }
-    let (own, other) = (escaped(elements.name(Kind::Geom, worst.own)), escaped(elements.name(Kind::Geom, worst.other)));
+    let (own, other) =
+        (escaped(elements.name(ElementKind::Geom, worst.own)), escaped(elements.name(ElementKind::Geom, worst.other)));
     Err(table.error(if limit.is_finite() {
         format!(
             "below {limit} it would do nothing: MuJoCo takes the larger friction of two geoms that touch, and {other:?} \
@@ -196,7 +199,7 @@ fn friction(
 }
 
 /// Returns the smallest number that an edit can write into the model, at the lower or upper bound of the parameter.
-fn smallest(edit: &Edit, parameter: &EditedParameter, model: &Model) -> f64 {
+fn smallest(edit: &ParameterEdit, parameter: &EditedParameter, model: &Model) -> f64 {
     let bounds = parameter.parameter.bounds;
     let numbers = edit
         .targets

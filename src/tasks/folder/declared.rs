@@ -6,10 +6,10 @@ use super::{
     error::{Result, escaped},
     parameter::sets,
     rules::leaked,
-    table::Table,
+    table::TomlTable,
 };
-use crate::env::{EnvironmentSpec, Parameter, PushSpec, Version, check_distribution, disturbance};
-use perturb_mujoco::{Index, Kind, Model};
+use crate::env::{EnvironmentSpec, ParameterSpec, PushSpec, Version, check_distribution, disturbance};
+use perturb_mujoco::{ElementKind, Index, Model};
 
 const SETS: &[&str] = &["random", "extreme"];
 const PUSH: &[&str] = &["body", "axes"];
@@ -26,7 +26,7 @@ pub(super) struct Push {
 impl Push {
     /// Reads the table `push`. The default is the first body that can move, pushed along x and y. Returns `None` if no
     /// body can move.
-    pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Option<Self>> {
+    pub(super) fn new(table: Option<&TomlTable<'_>>, model: &Model, elements: &Elements) -> Result<Option<Self>> {
         // For each body, the index of the topmost body to which it is rigidly fixed, possibly its own index. Index 0 is
         // the world.
         let fixed_to = model.index_array(Index::BodyWeld);
@@ -35,7 +35,7 @@ impl Push {
         if let Some(table) = table {
             table.only(PUSH)?;
             if let Some(value) = table.get("body") {
-                let found = elements.find(Kind::Body, &value)?;
+                let found = elements.find(ElementKind::Body, &value)?;
                 if fixed_to[found] == 0 {
                     return Err(value.error("this body cannot move; name one with a joint"));
                 }
@@ -52,7 +52,7 @@ impl Push {
         }
         Ok(body.map(|body| {
             let along: Vec<&str> = axes.iter().map(|&axis| AXES[axis]).collect();
-            let (name, along) = (elements.name(Kind::Body, body), along.join(" and "));
+            let (name, along) = (elements.name(ElementKind::Body, body), along.join(" and "));
             let description = leaked(&format!("impulse of a push on {name} along {along}"));
             Self { body, spec: PushSpec { description, unit: "N s", axes } }
         }))
@@ -61,7 +61,7 @@ impl Push {
 
 /// Reads the table `disturbances`, whose keys are names of disturbances. Returns each named disturbance with its values
 /// in versions R and E.
-pub(super) fn read(top: &Table<'_>, spec: &EnvironmentSpec) -> Result<Vec<Parameter>> {
+pub(super) fn read(top: &TomlTable<'_>, spec: &EnvironmentSpec) -> Result<Vec<ParameterSpec>> {
     let Some(value) = top.get("disturbances") else { return Ok(Vec::new()) };
     let table = value.table()?;
     let possible = disturbance::possible(spec);
@@ -72,7 +72,7 @@ pub(super) fn read(top: &Table<'_>, spec: &EnvironmentSpec) -> Result<Vec<Parame
         let table = value.table()?.at(format!("disturbance {}", escaped(parameter.name)));
         table.only(SETS)?;
         let (random, extreme) = sets(&table, (parameter.bounds.low, parameter.bounds.high), parameter.default)?;
-        let own = Parameter { random, extreme, ..parameter };
+        let own = ParameterSpec { random, extreme, ..parameter };
         for version in [Version::R, Version::E] {
             check_distribution(spec, &own, &own.distribution(version)).map_err(|error| table.error(error))?;
         }

@@ -1,9 +1,9 @@
 //! Finds parameters without a visible effect: a short simulation gives the same bytes with the extreme values of
 //! version E as with the defaults.
 
-use super::environment::Task;
+use super::environment::FolderTask;
 use crate::{
-    env::{Purpose, Stream},
+    env::{DrawPurpose, PhiloxStream},
     tasks::shared,
 };
 use perturb_mujoco::{Error, Simulation};
@@ -17,7 +17,7 @@ const N_STEPS: usize = 200;
 ///
 /// # Errors
 /// MuJoCo's fatal errors.
-pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
+pub(super) fn unseen(task: &'static FolderTask) -> Result<Vec<&'static str>, Error> {
     let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
     let own = trajectory(task, &defaults)?;
     let mut unseen = Vec::new();
@@ -37,11 +37,11 @@ pub(super) fn unseen(task: &'static Task) -> Result<Vec<&'static str>, Error> {
 
 /// Simulates [`N_STEPS`] timesteps with random controls, and returns the bits of all positions and velocities after
 /// each timestep. Stops early if the physics diverge. `values` are the values of the parameters.
-fn trajectory(task: &'static Task, values: &[f64]) -> Result<Vec<u64>, Error> {
+fn trajectory(task: &'static FolderTask, values: &[f64]) -> Result<Vec<u64>, Error> {
     let edit = task.template.edit(&task.parameters, values)?;
     shared::with(&task.template, |shared| {
         let (simulation, _) = shared.at(&edit, &task.template.state)?;
-        let mut stream = Stream::new(0, 0, Purpose::InitialState, 0);
+        let mut stream = PhiloxStream::new(0, 0, DrawPurpose::InitialState, 0);
         let mut states = Vec::new();
         for _ in 0..N_STEPS {
             for (ctrl, &(low, high)) in simulation.ctrl_mut().iter_mut().zip(&task.controls) {

@@ -4,26 +4,26 @@ use super::{
     error::{Result, escaped, listed},
     table::Value,
 };
-use perturb_mujoco::{Index, Kind, Model};
+use perturb_mujoco::{ElementKind, Index, Model};
 use perturb_protocol::names::did_you_mean;
 
 /// The names of all elements of a model, by kind. An element without a name is called by its index, such as `#3`.
 #[derive(Debug)]
 pub(super) struct Elements {
-    names: Vec<(Kind, Vec<String>)>,
+    names: Vec<(ElementKind, Vec<String>)>,
 }
 
-const KINDS: [Kind; 10] = [
-    Kind::Body,
-    Kind::Joint,
-    Kind::Geom,
-    Kind::Site,
-    Kind::Actuator,
-    Kind::Sensor,
-    Kind::Tendon,
-    Kind::Pair,
-    Kind::Camera,
-    Kind::Keyframe,
+const KINDS: [ElementKind; 10] = [
+    ElementKind::Body,
+    ElementKind::Joint,
+    ElementKind::Geom,
+    ElementKind::Site,
+    ElementKind::Actuator,
+    ElementKind::Sensor,
+    ElementKind::Tendon,
+    ElementKind::Pair,
+    ElementKind::Camera,
+    ElementKind::Keyframe,
 ];
 
 impl Elements {
@@ -34,17 +34,17 @@ impl Elements {
     }
 
     /// The names of all elements of a kind, in the model's order.
-    pub(super) fn names(&self, kind: Kind) -> &[String] {
+    pub(super) fn names(&self, kind: ElementKind) -> &[String] {
         self.names.iter().find(|(known, _)| *known == kind).map_or(&[], |(_, names)| names)
     }
 
     /// The name of the element with this index.
-    pub(super) fn name(&self, kind: Kind, id: usize) -> &str {
+    pub(super) fn name(&self, kind: ElementKind, id: usize) -> &str {
         self.names(kind).get(id).map_or("", String::as_str)
     }
 
     /// Returns the index of the element whose name is the text `value`.
-    pub(super) fn find(&self, kind: Kind, value: &Value<'_>) -> Result<usize> {
+    pub(super) fn find(&self, kind: ElementKind, value: &Value<'_>) -> Result<usize> {
         let name = value.text()?;
         self.names(kind).iter().position(|known| known == name).ok_or_else(|| self.unknown(kind, name, value))
     }
@@ -52,12 +52,12 @@ impl Elements {
     /// Returns the indices of the elements that `value` names: a name, a pattern with `*` and `?`, or a list of names
     /// and patterns. The indices are in the order of the list, and within a pattern in the model's order. A pattern
     /// never matches the world body.
-    pub(super) fn select(&self, kind: Kind, value: &Value<'_>) -> Result<Vec<usize>> {
+    pub(super) fn select(&self, kind: ElementKind, value: &Value<'_>) -> Result<Vec<usize>> {
         let mut selected = Vec::new();
         for pattern in value.texts()? {
             let names = self.names(kind).iter().enumerate();
             let is_pattern = pattern.contains(['*', '?']);
-            let first = usize::from(is_pattern && kind == Kind::Body);
+            let first = usize::from(is_pattern && kind == ElementKind::Body);
             let hits = names.skip(first).filter(|(_, name)| matches(pattern, name)).map(|(id, _)| id);
             let hits: Vec<usize> = hits.collect();
             if hits.is_empty() {
@@ -72,7 +72,7 @@ impl Elements {
         Ok(selected)
     }
 
-    fn unknown(&self, kind: Kind, name: &str, value: &Value<'_>) -> super::error::Error {
+    fn unknown(&self, kind: ElementKind, name: &str, value: &Value<'_>) -> super::error::Error {
         let names = self.names(kind).iter().map(String::as_str);
         let hint = did_you_mean(name, names.clone());
         let kind = kind.name();
@@ -82,9 +82,9 @@ impl Elements {
 
 /// Returns the name of an actuator. If the actuator has no name, returns the name of the joint that it drives.
 pub(super) fn actuator_name(model: &Model, elements: &Elements, actuator: usize) -> String {
-    let name = elements.name(Kind::Actuator, actuator);
+    let name = elements.name(ElementKind::Actuator, actuator);
     match actuated_joint(model, actuator) {
-        Some(joint) if name.starts_with('#') => elements.name(Kind::Joint, joint).to_owned(),
+        Some(joint) if name.starts_with('#') => elements.name(ElementKind::Joint, joint).to_owned(),
         _ => name.to_owned(),
     }
 }

@@ -2,20 +2,20 @@
 //! episodes.
 
 use super::{
-    number::{Context, Stage},
+    number::{Stage, StepActions},
     parameter::{AppliedQuantity, EditedParameter},
     reading::Reading,
-    reset::Reset,
-    reward::{Step, Term},
+    reset::InitialStateDistribution,
+    reward::{StepValues, Term},
     rules::{Best, Goal, Range},
     template::{ModelEdit, Template},
 };
 use crate::{
-    env::{Action, Environment, EnvironmentSpec, Error, Parameter, Stream, Transition},
+    env::{Action, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream, Transition},
     scene::{Look, PosedModel, Scene},
     tasks::shared,
 };
-use perturb_mujoco::{Error as SimulationError, Field, Simulation};
+use perturb_mujoco::{Error as SimulationError, ModelField, Simulation};
 use std::sync::Arc;
 
 /// Maximal absolute position or velocity in a saved state. MuJoCo reports divergence above this value.
@@ -35,7 +35,7 @@ pub(super) enum Poses {
 }
 
 /// The task of a folder, with its compiled model. It lives as long as the process.
-pub(super) struct Task {
+pub(super) struct FolderTask {
     pub(super) spec: EnvironmentSpec,
     pub(super) template: Template,
     pub(super) hash: String,
@@ -47,7 +47,7 @@ pub(super) struct Task {
     pub(super) healthy: Vec<Range>,
     pub(super) terminate_when_unhealthy: bool,
     pub(super) goal: Goal,
-    pub(super) reset: Reset,
+    pub(super) reset: InitialStateDistribution,
     /// The range (low, high) of each control. An action has one entry for each control.
     pub(super) controls: Vec<(f64, f64)>,
     /// Whether actions are scaled, so that -1 and 1 stand for the ends of the control's range.
@@ -57,7 +57,7 @@ pub(super) struct Task {
     /// The index of the body that is pushed; `None` if no body can move.
     pub(super) pushed_body: Option<usize>,
     /// The disturbances whose values in versions R and E the file configures. The catalogue lists them as parameters.
-    pub(super) disturbances: Vec<Parameter>,
+    pub(super) disturbances: Vec<ParameterSpec>,
     pub(super) needs: Needs,
     /// Whether the model's text has `settotalmass`, which scales all masses. Edited masses are not scaled again.
     pub(super) has_total_mass: bool,
@@ -102,7 +102,7 @@ impl Needs {
 /// An environment has no simulation of its own. Before each step, the environment's parameters and state are written
 /// into a shared simulation. After the step, the environment stores the new state and the results.
 pub(super) struct FolderEnvironment {
-    task: &'static Task,
+    task: &'static FolderTask,
     edit: Arc<ModelEdit>,
     /// The state in the layout of [`Simulation::state`]. It is undefined after the physics diverged.
     state: Box<[f64]>,
@@ -126,7 +126,7 @@ impl FolderEnvironment {
     ///
     /// # Errors
     /// [`Error::Model`] if there is not enough memory for a simulation.
-    pub(super) fn new(task: &'static Task) -> Result<Self, Error> {
+    pub(super) fn new(task: &'static FolderTask) -> Result<Self, Error> {
         let edit = task
             .template
             .edit(&task.parameters, &defaults(task))
@@ -176,7 +176,7 @@ impl FolderEnvironment {
                 simulation.external_forces()?;
             }
             let action = vec![0.0; self.action.len()];
-            let context = Context { action: &action, previous_action: &action };
+            let context = StepActions { action: &action, previous_action: &action };
             let mut remembered = Vec::with_capacity(self.remembered.len());
             for reading in task.reward.iter().filter_map(Term::remembered) {
                 reading.read(simulation, &context, &mut remembered);
@@ -192,7 +192,7 @@ impl FolderEnvironment {
     fn observe_now(
         &mut self,
         simulation: &Simulation,
-        context: &Context<'_>,
+        context: &StepActions<'_>,
         numbers: &mut Vec<f64>,
         is_first: bool,
     ) -> bool {
@@ -255,15 +255,15 @@ impl FolderEnvironment {
         }
         // Health, reward terms, goal and observation are computed from the same state, in this order.
         let (mut previous, mut remembered) = (std::mem::take(&mut self.action), std::mem::take(&mut self.remembered));
-        let context = Context { action, previous_action: &previous };
+        let context = StepActions { action, previous_action: &previous };
         let healthy = is_finite(simulation.qpos())
             && is_finite(simulation.qvel())
             && task.healthy.iter().all(|range| range.holds(simulation, &context, numbers));
-        let step = Step { context, healthy, seconds: task.spec.control_timestep, before: &remembered };
+        let step = StepValues { context, healthy, seconds: task.spec.control_timestep, before: &remembered };
         for (value, term) in reward_terms.iter_mut().zip(&task.reward) {
             *value = term.compute(simulation, &step, numbers);
         }
-        let context = Context { action, previous_action: &previous };
+        let context = StepActions { action, previous_action: &previous };
         numbers.clear();
         for reading in task.reward.iter().filter_map(Term::remembered) {
             reading.read(simulation, &context, numbers);
@@ -296,7 +296,7 @@ impl FolderEnvironment {
     }
 }
 
-fn defaults(task: &Task) -> Vec<f64> {
+fn defaults(task: &FolderTask) -> Vec<f64> {
     task.spec.parameters.iter().map(|parameter| parameter.default).collect()
 }
 
@@ -356,7 +356,7 @@ impl Environment for FolderEnvironment {
         self.push = Some(impulse.map(|impulse| impulse / self.task.spec.control_timestep));
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.clear();
         let reset = &self.task.reset;
         let (qpos, qvel) = self.positions_mut();
@@ -365,7 +365,8 @@ impl Environment for FolderEnvironment {
         // by the same differences.
         let (own, compiled) = (Arc::clone(&self.task.template.model), Arc::clone(&self.edit.compiled));
         if !Arc::ptr_eq(&own, &compiled) {
-            let initial = own.field(Field::InitialPositions).iter().zip(compiled.field(Field::InitialPositions));
+            let initial =
+                own.field(ModelField::InitialPositions).iter().zip(compiled.field(ModelField::InitialPositions));
             let (qpos, _) = self.positions_mut();
             qpos.iter_mut().zip(initial).for_each(|(q, (own, compiled))| *q += compiled - own);
         }

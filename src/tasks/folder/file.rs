@@ -4,26 +4,26 @@ use super::{
     attributes, checks,
     declared::{self, Push},
     elements::{Elements, actuator_name},
-    environment::{Needs, Poses, Task},
+    environment::{FolderTask, Needs, Poses},
     error::{Error, Result, escaped},
     files::Files,
     mjcf::{self, Mjcf},
-    number::{Entry, channel_name, unique_channels},
+    number::{NumberDescription, channel_name, unique_channels},
     parameter::{AppliedQuantity, EditedParameter},
     picture,
     reading::Reading,
     recompilation::Recompilation,
-    reset::Reset,
+    reset::InitialStateDistribution,
     reward::Term,
     rules::{Goal, Range, leaked},
-    table::{self, Table},
+    table::{self, TomlTable},
     template::Template,
 };
 use crate::{
-    env::{ActionSpace, Channel, EnvironmentSpec, Quantity},
+    env::{ActionSpec, ChannelSpec, EnvironmentSpec, QuantitySpec},
     scene::Look,
 };
-use perturb_mujoco::{Field, Flags, Index, Kind, Model};
+use perturb_mujoco::{ElementKind, Flags, Index, Model, ModelField};
 use perturb_protocol::names::is_spelled;
 
 /// The keys at the top level of `task.toml`.
@@ -70,10 +70,10 @@ const MAX_NAME_CHARS: usize = 64;
 ///
 /// # Errors
 /// [`Error`] with the file, the line and what to do.
-pub(super) fn read(files: &mut Files) -> Result<Task> {
+pub(super) fn read(files: &mut Files) -> Result<FolderTask> {
     let text = table::decode(table::FILE, files.task())?.to_owned();
     let document = table::parse(&text)?;
-    let top = Table::top(&text, &document);
+    let top = TomlTable::top(&text, &document);
     let format = top.require("format", "1")?;
     if format.integer(0, u32::MAX)? != FORMAT {
         return Err(format.error(format_args!("this server reads format {FORMAT}; a newer server may read this one")));
@@ -94,7 +94,7 @@ pub(super) fn read(files: &mut Files) -> Result<Task> {
 
 /// Whether any parameter may edit a length. Such edits require that the model is compiled again. Errors in the tables
 /// are ignored here, since they are reported later.
-fn edits_lengths(top: &Table<'_>) -> bool {
+fn edits_lengths(top: &TomlTable<'_>) -> bool {
     let parameters = top.tables("parameter").unwrap_or_default();
     let mut edits = parameters.iter().flat_map(|table| table.tables("edit").unwrap_or_default());
     edits.any(|edit| matches!(edit.text("field"), Ok(Some("length" | "size" | "position" | "radius"))))
@@ -111,7 +111,7 @@ struct Header {
 }
 
 impl Header {
-    fn new(top: &Table<'_>) -> Result<Self> {
+    fn new(top: &TomlTable<'_>) -> Result<Self> {
         let name_value = top.require("name", "\"MyRobot\"")?;
         let name = name_value.text()?;
         let plain = name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
@@ -188,7 +188,12 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
 }
 
 /// Builds the task from the parsed file and the compiled model. `hash` is the hash of the folder's files.
-fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &str), hash: String) -> Result<Task> {
+fn assemble(
+    top: &TomlTable<'_>,
+    about: Header,
+    (mjcf, model, main): (Mjcf, Model, &str),
+    hash: String,
+) -> Result<FolderTask> {
     // The parts of the task that read the model, but do not edit it.
     let elements = Elements::new(&model);
     let observation = top.require("observation", "[{ joint = \"*\", get = \"position\" }]")?.tables()?;
@@ -203,7 +208,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let success = top.require("success", "{ description = \"it stood to the end\", steps = true, at_least = 1000 }")?;
     let goal = Goal::new(&success.table()?, &model, &elements, about.step_limit)?;
     let reset = top.get("reset").map(|value| value.table()).transpose()?;
-    let reset = Reset::new(reset.as_ref(), &model, &elements)?;
+    let reset = InitialStateDistribution::new(reset.as_ref(), &model, &elements)?;
     let picture = top.get("picture").map(|value| value.table()).transpose()?;
     let view = picture::view(picture.as_ref(), &model, &elements)?;
     let (controls, scaled) = controls(top, &model, &elements)?;
@@ -219,7 +224,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     let needs = Needs::new(&observation, &reward, &healthy, &goal);
     // The description. Its closure `make` is set in `load`, when the task has its final address.
     let quantities =
-        parameters.iter().map(|edited| Quantity { name: edited.parameter.name, unit: edited.parameter.unit });
+        parameters.iter().map(|edited| QuantitySpec { name: edited.parameter.name, unit: edited.parameter.unit });
     let spec = EnvironmentSpec {
         name: about.name,
         revision: about.revision,
@@ -227,7 +232,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
         make: &|| Err(crate::env::Error::Model { environment: "", reason: "it is not loaded yet".into() }),
         parameters: leaked_list(parameters.iter().map(|edited| edited.parameter)),
         observation: observation_channels(&observation),
-        action: ActionSpace::Continuous(action_channels(&template.model, &elements, &controls, scaled)),
+        action: ActionSpec::Continuous(action_channels(&template.model, &elements, &controls, scaled)),
         state: state_channels(&template.model, &elements),
         reward_terms: leaked_list(reward.iter().map(|term| term.about)),
         applied: leaked_list(quantities.chain(applied.iter().map(|applied| applied.quantity))),
@@ -247,7 +252,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
         scenery: None,
         view,
     };
-    Ok(Task {
+    Ok(FolderTask {
         spec,
         template,
         hash,
@@ -271,7 +276,7 @@ fn assemble(top: &Table<'_>, about: Header, (mjcf, model, main): (Mjcf, Model, &
     })
 }
 
-fn reward(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<Vec<Term>> {
+fn reward(top: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Vec<Term>> {
     let value = top.require("reward", "[{ name = \"alive\", constant = 1.0 }]")?;
     let (mut terms, mut n_remembered): (Vec<Term>, usize) = (Vec::new(), 0);
     for table in value.tables()? {
@@ -291,7 +296,7 @@ fn reward(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<Vec<Ter
 }
 
 /// Returns the range of each control, and whether actions are scaled so that ±1 are the ends of the range.
-fn controls(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<(Vec<(f64, f64)>, bool)> {
+fn controls(top: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<(Vec<(f64, f64)>, bool)> {
     let table = top.get("actions").map(|value| value.table()).transpose()?;
     let (mut scaled, mut given) = (false, None);
     if let Some(table) = &table {
@@ -301,7 +306,7 @@ fn controls(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<(Vec<
     }
     let range = |actuator: usize| {
         let limited = model.flags(Flags::ActuatorControlLimited)[actuator] != 0;
-        let own = &model.field(Field::ActuatorControlRange)[2 * actuator..][..2];
+        let own = &model.field(ModelField::ActuatorControlRange)[2 * actuator..][..2];
         match (limited, given) {
             (true, _) => Ok((own[0], own[1])),
             (false, Some(range)) => Ok(range),
@@ -320,7 +325,7 @@ fn controls(top: &Table<'_>, model: &Model, elements: &Elements) -> Result<(Vec<
 }
 
 fn parameters(
-    top: &Table<'_>,
+    top: &TomlTable<'_>,
     model: &Model,
     elements: &Elements,
 ) -> Result<(Vec<EditedParameter>, Vec<AppliedQuantity>)> {
@@ -329,7 +334,7 @@ fn parameters(
         return Err(top.error(format_args!("there are {} parameters, the limit is {MAX_PARAMETERS}", tables.len())));
     }
     let mut names = std::collections::BTreeSet::new();
-    let mut unique = |table: &Table<'_>, name: &'static str| {
+    let mut unique = |table: &TomlTable<'_>, name: &'static str| {
         let problem = "there are two parameters or applied quantities of this name; give each a name of its own";
         if names.insert(name) { Ok(()) } else { Err(table.error(format_args!("{name}: {problem}"))) }
     };
@@ -351,7 +356,7 @@ fn parameters(
 
 /// Returns the two parameters that heat maps show: those that the file names, otherwise the first two. `None` if there
 /// are fewer than two.
-fn heatmap_axes(top: &Table<'_>, parameters: &[EditedParameter]) -> Result<Option<[&'static str; 2]>> {
+fn heatmap_axes(top: &TomlTable<'_>, parameters: &[EditedParameter]) -> Result<Option<[&'static str; 2]>> {
     let names: Vec<&'static str> = parameters.iter().map(|edited| edited.parameter.name).collect();
     let Some(value) = top.get("heatmap") else {
         return Ok(match names[..] {
@@ -371,14 +376,21 @@ fn leaked_list<T>(items: impl Iterator<Item = T>) -> &'static [T] {
     Box::leak(items.collect::<Vec<T>>().into_boxed_slice())
 }
 
-fn observation_channels(observation: &[Reading]) -> &'static [Channel] {
+fn observation_channels(observation: &[Reading]) -> &'static [ChannelSpec] {
     let entries = || observation.iter().flat_map(Reading::entries);
     let names = unique_channels(entries());
-    let channel = |(name, entry): (String, &Entry)| Channel::new(leaked(&name), entry.unit, entry.low, entry.high);
+    let channel = |(name, entry): (String, &NumberDescription)| {
+        ChannelSpec::new(leaked(&name), entry.unit, entry.low, entry.high)
+    };
     leaked_list(names.into_iter().zip(entries()).map(channel))
 }
 
-fn action_channels(model: &Model, elements: &Elements, controls: &[(f64, f64)], scaled: bool) -> &'static [Channel] {
+fn action_channels(
+    model: &Model,
+    elements: &Elements,
+    controls: &[(f64, f64)],
+    scaled: bool,
+) -> &'static [ChannelSpec] {
     let mut names: Vec<String> = Vec::new();
     for actuator in 0..model.n_u() {
         let name = channel_name(&actuator_name(model, elements, actuator));
@@ -386,18 +398,18 @@ fn action_channels(model: &Model, elements: &Elements, controls: &[(f64, f64)], 
     }
     let channel = |(name, &(low, high)): (&String, &(f64, f64))| {
         let (low, high) = if scaled { (-1.0, 1.0) } else { (low, high) };
-        Channel::new(leaked(name), "1", low, high)
+        ChannelSpec::new(leaked(name), "1", low, high)
     };
     leaked_list(names.iter().zip(controls).map(channel))
 }
 
 /// Returns the entries of an exact state: positions, then velocities. The bounds of the entries are far beyond the
 /// values of any episode, and exclude only absurd numbers.
-fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
+fn state_channels(model: &Model, elements: &Elements) -> &'static [ChannelSpec] {
     let mut channels = Vec::new();
     for is_velocity in [false, true] {
         for joint in 0..model.n_joint() {
-            let name = channel_name(elements.name(Kind::Joint, joint));
+            let name = channel_name(elements.name(ElementKind::Joint, joint));
             let (position, velocity): (&[&str], &[&str]) = match model.index_array(Index::JointType)[joint] {
                 0 => (&["_x", "_y", "_z", "_qw", "_qx", "_qy", "_qz"], &["_vx", "_vy", "_vz", "_wx", "_wy", "_wz"]),
                 1 => (&["_qw", "_qx", "_qy", "_qz"], &["_wx", "_wy", "_wz"]),
@@ -414,10 +426,10 @@ fn state_channels(model: &Model, elements: &Elements) -> &'static [Channel] {
                     (true, ..) => ("rad/s", 1e4),
                 };
                 let mut full = format!("{name}{part}");
-                if channels.iter().any(|channel: &Channel| channel.name == full) {
+                if channels.iter().any(|channel: &ChannelSpec| channel.name == full) {
                     full = format!("{full}_{}", channels.len());
                 }
-                channels.push(Channel::new(leaked(&full), unit, -limit, limit));
+                channels.push(ChannelSpec::new(leaked(&full), unit, -limit, limit));
             }
         }
     }

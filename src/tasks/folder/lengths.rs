@@ -10,10 +10,10 @@ use super::{
     checks::can_touch,
     error::Result,
     mjcf::{Text, parse, write_attribute},
-    parameter::{Edit, EditedParameter},
+    parameter::{EditedParameter, ParameterEdit},
     target::{Change, Target},
 };
-use perturb_mujoco::{Field, Index, Model};
+use perturb_mujoco::{Index, Model, ModelField};
 use roxmltree::Node;
 use std::collections::BTreeMap;
 
@@ -23,7 +23,7 @@ use std::collections::BTreeMap;
 pub(super) struct Slot {
     /// The index of the parameter.
     pub(super) parameter: usize,
-    edit: Edit,
+    edit: ParameterEdit,
     target: Target,
     /// The value in the unedited model.
     own: f64,
@@ -432,8 +432,8 @@ pub(super) fn attachment(model: &Model, body: usize) -> [f64; 3] {
     let (types, bodies) = (model.index_array(Index::JointType), model.index_array(Index::JointBody));
     let is_own = |&joint: &usize| bodies[joint] as usize == body && matches!(types[joint], 1 | 3);
     let Some(joint) = (0..model.n_joint()).find(is_own) else { return [0.0; 3] };
-    let anchor: [f64; 3] = std::array::from_fn(|i| model.field(Field::JointAnchor)[3 * joint + i]);
-    let rotation = &model.field(Field::BodyRotation)[4 * body..][..4];
+    let anchor: [f64; 3] = std::array::from_fn(|i| model.field(ModelField::JointAnchor)[3 * joint + i]);
+    let rotation = &model.field(ModelField::BodyRotation)[4 * body..][..4];
     if anchor == [0.0; 3] || *rotation == [1.0, 0.0, 0.0, 0.0] {
         return anchor;
     }

@@ -1,7 +1,7 @@
 //! Loads a folder into memory, where it stays until the process ends.
 
 use super::{
-    environment::{FolderEnvironment, Task},
+    environment::{FolderEnvironment, FolderTask},
     error::Error,
     file,
     files::Files,
@@ -13,13 +13,13 @@ use std::{fmt, path::Path, sync::OnceLock};
 /// A handle to a loaded folder. The folder stays in memory until the process ends, because environments, catalogues and
 /// sessions refer to it.
 #[derive(Clone, Copy)]
-pub struct Folder {
-    pub(super) task: &'static Task,
+pub struct TaskFolder {
+    pub(super) task: &'static FolderTask,
     spec: &'static EnvironmentSpec,
     pub(super) files: &'static Files,
 }
 
-impl Folder {
+impl TaskFolder {
     /// The description of the environment. If the file configures values of a disturbance in versions R and E, all
     /// disturbances are among the parameters.
     pub fn spec(&self) -> &'static EnvironmentSpec {
@@ -32,9 +32,9 @@ impl Folder {
     }
 }
 
-impl fmt::Debug for Folder {
+impl fmt::Debug for TaskFolder {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Folder").field("name", &self.task.spec.name).finish_non_exhaustive()
+        f.debug_struct("TaskFolder").field("name", &self.task.spec.name).finish_non_exhaustive()
     }
 }
 
@@ -45,26 +45,26 @@ impl fmt::Debug for Folder {
 ///
 /// # Errors
 /// [`Error`] with the file, the line and what to do.
-pub fn load(folder: &Path) -> Result<Folder, Error> {
+pub fn load(folder: &Path) -> Result<TaskFolder, Error> {
     let mut files = Files::open(folder)?;
     let task = file::read(&mut files)?;
     if !files.are_unchanged() {
         return Err(Error::folder("the files changed while they were loaded; load the folder again"));
     }
     let files: &'static Files = Box::leak(Box::new(files));
-    let task: &'static mut Task = Box::leak(Box::new(task));
+    let task: &'static mut FolderTask = Box::leak(Box::new(task));
     // The task contains the spec, whose closure refers to the task. So the closure reads the task's address from a
     // cell, which is set below.
-    let address: &'static OnceLock<&'static Task> = Box::leak(Box::default());
+    let address: &'static OnceLock<&'static FolderTask> = Box::leak(Box::default());
     task.spec.make = Box::leak(Box::new(move || match address.get() {
         Some(task) => Ok(Box::new(FolderEnvironment::new(task)?) as Box<dyn env::Environment>),
         None => Err(env::Error::Model { environment: "", reason: "it is not loaded yet".into() }),
     }));
-    let task: &'static Task = task;
+    let task: &'static FolderTask = task;
     let _ = address.set(task); // cannot fail: it is set only here
     let declared = &task.disturbances;
     let spec = if declared.is_empty() { &task.spec } else { disturbance::declare(&task.spec, declared) };
-    Ok(Folder { task, spec, files })
+    Ok(TaskFolder { task, spec, files })
 }
 
 /// Reads and checks the model file `main` of a folder and its includes, without compiling it by MuJoCo. Meant for tests

@@ -41,7 +41,7 @@ mod target;
 mod template;
 
 pub use error::{Error, LoadError};
-pub use load::{Folder, load, read_model};
+pub use load::{TaskFolder, load, read_model};
 pub use report::report;
 
 /// The JSON schema of `task.toml`, as text.

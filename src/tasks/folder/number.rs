@@ -1,6 +1,6 @@
 //! The numbers that a task can read from a simulation, and how each is computed.
 
-use perturb_mujoco::{Field, Model, Reading as Array, Simulation};
+use perturb_mujoco::{DataField as Array, Model, ModelField, Simulation};
 
 /// The computation that MuJoCo must do before a number can be read. Each stage includes the previous one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
@@ -34,9 +34,9 @@ pub(super) enum Number {
     /// A coordinate of the common centre of mass of several bodies: (bodies, axis).
     Centre(Vec<usize>, usize),
     /// A component of the vector from one point to another: (from, to, axis).
-    Between(Point, Point, usize),
+    Between(PointSource, PointSource, usize),
     /// The distance between two points.
-    Distance(Point, Point),
+    Distance(PointSource, PointSource),
     /// An entry of the action, as it was received.
     Action(usize),
     /// An entry of the previous step's action.
@@ -48,14 +48,14 @@ pub(super) enum Number {
 
 /// A point whose position MuJoCo computes: of a body, a site or a geom.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Point {
+pub(super) struct PointSource {
     pub(super) array: Array,
     pub(super) id: usize,
 }
 
 /// The description of a number: its names, unit and range.
 #[derive(Debug, Clone)]
-pub(super) struct Entry {
+pub(super) struct NumberDescription {
     /// The name in `task.toml`, such as `root.x`, by which the keys `without` and `axes` select it.
     pub(super) name: String,
     /// The name of the model element alone, such as `root`.
@@ -70,7 +70,7 @@ pub(super) struct Entry {
 }
 
 /// The actions that numbers may read in addition to the simulation.
-pub(super) struct Context<'a> {
+pub(super) struct StepActions<'a> {
     /// The action of the step, as it was received.
     pub(super) action: &'a [f32],
     /// The action of the previous step; zeros after a reset.
@@ -78,7 +78,7 @@ pub(super) struct Context<'a> {
 }
 
 /// Returns the channel names of numbers, made unique by prefixes and suffixes where necessary.
-pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> Vec<String> {
+pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a NumberDescription>) -> Vec<String> {
     let mut names: Vec<String> = Vec::new();
     let mut taken = std::collections::BTreeSet::new();
     for entry in entries {
@@ -99,9 +99,9 @@ pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a Entry>) -> V
 
 /// Creates the description of a number without bounds. Its name is `element.part`, or `element` if `part` is empty; its
 /// channel name is made from `suffix`.
-pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static str) -> Entry {
+pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static str) -> NumberDescription {
     let name = if part.is_empty() { element.to_owned() } else { format!("{element}.{part}") };
-    Entry {
+    NumberDescription {
         name,
         element: element.to_owned(),
         kind: "",
@@ -148,7 +148,7 @@ impl Number {
     }
 
     /// Appends the number, or the numbers of an array, to `out`.
-    pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
+    pub(super) fn read(&self, simulation: &Simulation, context: &StepActions<'_>, out: &mut Vec<f64>) {
         let value = match self {
             Self::Array(array, first, length) => {
                 out.extend_from_slice(&simulation.reading(*array)[*first..first + length]);
@@ -186,7 +186,7 @@ impl Number {
     }
 }
 
-impl Point {
+impl PointSource {
     fn read(self, simulation: &Simulation) -> &[f64] {
         &simulation.reading(self.array)[3 * self.id..][..3]
     }
@@ -194,6 +194,6 @@ impl Point {
 
 /// Scales a joint's position so that its range becomes ±1.
 pub(super) fn scaled(model: &Model, joint: usize, position: f64) -> f64 {
-    let range = &model.field(Field::JointRange)[2 * joint..][..2];
+    let range = &model.field(ModelField::JointRange)[2 * joint..][..2];
     2.0 * (position - (range[0] + range[1]) / 2.0) / (range[1] - range[0])
 }

@@ -6,11 +6,11 @@ use super::{
     error::{Result, escaped},
     reward::identifier,
     rules::leaked,
-    table::{Table, Value},
+    table::{TomlTable, Value},
     target::{Change, KEYS, Target, Targets},
 };
-use crate::env::{Interval, Parameter, Quantity};
-use perturb_mujoco::{Field, Model, Simulation};
+use crate::env::{Interval, ParameterSpec, QuantitySpec};
+use perturb_mujoco::{Model, ModelField, Simulation};
 
 const PARAMETER: &[&str] = &["name", "unit", "description", "edit", "default", "bounds", "random", "extreme"];
 const EDIT: [&str; 2] = ["by", "factor"];
@@ -18,7 +18,7 @@ const APPLIED: [&str; 2] = ["name", "unit"];
 
 /// An edit: the numbers of the model that a parameter changes in the same way.
 #[derive(Debug, Clone)]
-pub(super) struct Edit {
+pub(super) struct ParameterEdit {
     pub(super) targets: Targets,
     pub(super) change: Change,
     factor: f64,
@@ -27,13 +27,13 @@ pub(super) struct Edit {
 /// A parameter, and the edits of the model that it makes.
 #[derive(Debug, Clone)]
 pub(super) struct EditedParameter {
-    pub(super) parameter: Parameter,
-    pub(super) edits: Vec<Edit>,
+    pub(super) parameter: ParameterSpec,
+    pub(super) edits: Vec<ParameterEdit>,
 }
 
 impl EditedParameter {
     /// Reads a parameter from its TOML table.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         let name = table.require("name", "\"torso_mass\"")?;
         let name = identifier(&name, name.text()?)?;
         let table = &table.clone().at(format!("parameter {name}"));
@@ -42,7 +42,7 @@ impl EditedParameter {
         let description = table.require("description", "\"mass of the torso, whose inertia follows\"")?.text()?;
         let edit = table.require("edit", "[{ body = \"torso\", field = \"mass\", by = \"set\" }]")?;
         let edits = edit.tables()?;
-        let edits = edits.iter().map(|table| Edit::new(table, model, elements)).collect::<Result<Vec<_>>>()?;
+        let edits = edits.iter().map(|table| ParameterEdit::new(table, model, elements)).collect::<Result<Vec<_>>>()?;
         let Some(first) = edits.first() else { return Err(edit.error("the list is empty; name at least one edit")) };
         if edits.iter().any(|edit| edit.change != first.change) {
             return Err(
@@ -53,11 +53,11 @@ impl EditedParameter {
         let bounds_value = table.require("bounds", "[0.1, 100.0]")?;
         let bounds = bounds_value.interval()?;
         let (random, extreme) = sets(table, bounds, default)?;
-        let parameter = Parameter {
+        let parameter = ParameterSpec {
             default,
             random,
             extreme,
-            ..Parameter::new(leaked(name), leaked(unit), leaked(description), bounds)
+            ..ParameterSpec::new(leaked(name), leaked(unit), leaked(description), bounds)
         };
         let edited = Self { parameter, edits };
         edited.check_physical(&bounds_value, model)?;
@@ -77,7 +77,7 @@ impl EditedParameter {
                     let problem = format!("{value} would make a {field} of {number}; expected {than} {least}");
                     return Err(bounds.error(problem));
                 }
-                if let (Field::JointRange | Field::ActuatorForceRange, at) = target.place() {
+                if let (ModelField::JointRange | ModelField::ActuatorForceRange, at) = target.place() {
                     edit.check_range(bounds, model, (*target, at), value)?;
                 }
             }
@@ -86,7 +86,7 @@ impl EditedParameter {
     }
 
     /// Returns the array and the index of each number of the model that the parameter edits.
-    pub(super) fn places(&self) -> impl Iterator<Item = (Field, usize)> + '_ {
+    pub(super) fn places(&self) -> impl Iterator<Item = (ModelField, usize)> + '_ {
         self.targets().map(Target::place)
     }
 
@@ -137,8 +137,8 @@ impl EditedParameter {
     }
 }
 
-impl Edit {
-    fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+impl ParameterEdit {
+    fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&KEYS[..], &EDIT].concat())?;
         let by = table.require("by", "\"set\"")?;
         let change = match by.text()? {
@@ -172,7 +172,8 @@ impl Edit {
         }
     }
 
-    /// Returns the parameter's value from the `number` that an edit wrote or added, the inverse of [`Edit::number`].
+    /// Returns the parameter's value from the `number` that an edit wrote or added, the inverse of
+    /// [`ParameterEdit::number`].
     fn unscaled(&self, number: f64) -> f64 {
         if self.factor.abs() == 1.0 { number * self.factor } else { number / self.factor }
     }
@@ -193,11 +194,11 @@ impl Edit {
 }
 
 /// Returns the value of version D: the file's `default`, otherwise the value in the model.
-fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
+fn default(table: &TomlTable<'_>, model: &Model, edits: &[ParameterEdit]) -> Result<f64> {
     if let Some(default) = table.number("default")? {
         return Ok(default);
     }
-    let own = |edit: &Edit| -> Vec<f64> {
+    let own = |edit: &ParameterEdit| -> Vec<f64> {
         match edit.change {
             Change::Set => edit.targets.all.iter().map(|target| edit.unscaled(target.value(model))).collect(),
             Change::Scale => vec![1.0],
@@ -220,7 +221,7 @@ fn default(table: &Table<'_>, model: &Model, edits: &[Edit]) -> Result<f64> {
 
 /// Reads the interval of version R and the two intervals of version E. The intervals of E must adjoin the interval of
 /// R, one below and one above.
-pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
+pub(super) fn sets(table: &TomlTable<'_>, bounds: (f64, f64), default: f64) -> Result<(Interval, [Interval; 2])> {
     let within = |value: &Value<'_>, name: &str, (low, high): (f64, f64)| {
         if bounds.0 <= low && high <= bounds.1 {
             return Ok(());
@@ -255,13 +256,13 @@ pub(super) fn sets(table: &Table<'_>, bounds: (f64, f64), default: f64) -> Resul
 /// A number of the model that receipts report in addition to the parameters.
 #[derive(Debug, Clone)]
 pub(super) struct AppliedQuantity {
-    pub(super) quantity: Quantity,
+    pub(super) quantity: QuantitySpec,
     target: Target,
 }
 
 impl AppliedQuantity {
     /// Reads an applied quantity from its TOML table.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&KEYS[..], &APPLIED].concat())?;
         let name = table.require("name", "\"torso_mass\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -273,7 +274,7 @@ impl AppliedQuantity {
             let problem = format!("this names {} numbers; name one", targets.all.len());
             return Err(table.error(problem));
         };
-        let quantity = Quantity { name: leaked(name), unit: leaked(table.text("unit")?.unwrap_or("1")) };
+        let quantity = QuantitySpec { name: leaked(name), unit: leaked(table.text("unit")?.unwrap_or("1")) };
         Ok(Self { quantity, target })
     }
 

@@ -3,11 +3,11 @@
 use super::{
     elements::Elements,
     error::{Result, escaped, listed},
-    number::{Context, Entry, Number, Stage},
+    number::{Number, NumberDescription, Stage, StepActions},
     reading_source::Source,
-    table::{Table, Value},
+    table::{TomlTable, Value},
 };
-use perturb_mujoco::{Kind, Model, Reading as Array, Simulation};
+use perturb_mujoco::{DataField as Array, ElementKind, Model, Simulation};
 
 /// The keys of a reading that say what is read. Each reading has exactly one of them.
 const SUBJECTS: [&str; 12] = [
@@ -31,14 +31,14 @@ const OPTIONS: [&str; 6] = ["to", "get", "axes", "without", "scale", "clip"];
 #[derive(Debug, Clone)]
 pub(super) struct Reading {
     numbers: Vec<Number>,
-    entries: Vec<Entry>,
+    entries: Vec<NumberDescription>,
     scale: f64,
     clip: Option<(f64, f64)>,
 }
 
 impl Reading {
     /// Reads the definition of a reading from its TOML table.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(&[&SUBJECTS[..], &OPTIONS].concat())?;
         let (subject, value) = table.one_of(&SUBJECTS).map_err(|_| {
             let subjects = SUBJECTS.join(", ");
@@ -54,8 +54,9 @@ impl Reading {
         }
         if let Some(without) = table.get("without") {
             for name in without.texts()? {
-                let fits = |entry: &Entry| entry.name == name || entry.element == name;
-                let is_left_out = subject == "joint" && elements.names(Kind::Joint).iter().any(|joint| joint == name);
+                let fits = |entry: &NumberDescription| entry.name == name || entry.element == name;
+                let is_left_out =
+                    subject == "joint" && elements.names(ElementKind::Joint).iter().any(|joint| joint == name);
                 if !is_left_out && !all.iter().any(|(_, entry)| fits(entry)) {
                     let there = listed(all.iter().map(|(_, entry)| entry.name.as_str()));
                     return Err(without.error(format_args!("there is no {:?} to leave out of {there}", escaped(name))));
@@ -85,7 +86,7 @@ impl Reading {
     }
 
     /// The names, units and ranges of the numbers.
-    pub(super) fn entries(&self) -> &[Entry] {
+    pub(super) fn entries(&self) -> &[NumberDescription] {
         &self.entries
     }
 
@@ -100,7 +101,7 @@ impl Reading {
     }
 
     /// Appends the numbers, scaled and clipped, to `out`.
-    pub(super) fn read(&self, simulation: &Simulation, context: &Context<'_>, out: &mut Vec<f64>) {
+    pub(super) fn read(&self, simulation: &Simulation, context: &StepActions<'_>, out: &mut Vec<f64>) {
         let begin = out.len();
         for number in &self.numbers {
             number.read(simulation, context, out);

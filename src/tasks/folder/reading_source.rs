@@ -3,10 +3,10 @@
 use super::{
     elements::{Elements, actuator_name},
     error::{Result, escaped},
-    number::{Entry, Number, Point, entry},
-    table::{Table, Value},
+    number::{Number, NumberDescription, PointSource, entry},
+    table::{TomlTable, Value},
 };
-use perturb_mujoco::{Field, Flags, Index, Kind, Model, Reading as Array};
+use perturb_mujoco::{DataField as Array, ElementKind, Flags, Index, Model, ModelField};
 
 /// The allowed values of the key `get` for a joint. The constants below list the allowed values for other kinds of
 /// elements.
@@ -31,13 +31,13 @@ const OF_TWO_POINTS: &[&str] = &["vector", "distance"];
 
 /// The TOML table of a reading, and the model to whose elements the table refers.
 pub(super) struct Source<'a> {
-    pub(super) table: &'a Table<'a>,
+    pub(super) table: &'a TomlTable<'a>,
     pub(super) model: &'a Model,
     pub(super) elements: &'a Elements,
 }
 
 /// Numbers with their names, units and ranges.
-pub(super) type Numbers = Vec<(Number, Entry)>;
+pub(super) type Numbers = Vec<(Number, NumberDescription)>;
 
 const AXES: [&str; 3] = ["x", "y", "z"];
 const FREE_POSITION: [&str; 7] = ["x", "y", "z", "qw", "qx", "qy", "qz"];
@@ -58,8 +58,8 @@ impl Source<'_> {
         match subject {
             "joint" => self.joints(value),
             "body" => self.bodies(value),
-            "site" => self.points(Kind::Site, value),
-            "geom" => self.points(Kind::Geom, value),
+            "site" => self.points(ElementKind::Site, value),
+            "geom" => self.points(ElementKind::Geom, value),
             "com" => self.centre(value),
             "from" => self.between(value),
             "sensor" => self.sensors(value),
@@ -96,14 +96,14 @@ impl Source<'_> {
 
     fn joints(&self, value: &Value<'_>) -> Result<Numbers> {
         let get = self.get("joint", OF_A_JOINT, None)?;
-        let (model, mut joints) = (self.model, self.elements.select(Kind::Joint, value)?);
+        let (model, mut joints) = (self.model, self.elements.select(ElementKind::Joint, value)?);
         if let Some(without) = self.table.get("without") {
             let names = without.texts()?;
-            joints.retain(|&joint| !names.contains(&self.elements.name(Kind::Joint, joint)));
+            joints.retain(|&joint| !names.contains(&self.elements.name(ElementKind::Joint, joint)));
         }
         let mut numbers = Numbers::new();
         for joint in joints {
-            let name = self.elements.name(Kind::Joint, joint);
+            let name = self.elements.name(ElementKind::Joint, joint);
             let kind = model.index_array(Index::JointType)[joint];
             let position = model.index_array(Index::JointPosition)[joint] as usize;
             let velocity = model.index_array(Index::JointVelocity)[joint] as usize;
@@ -160,8 +160,8 @@ impl Source<'_> {
     fn bodies(&self, value: &Value<'_>) -> Result<Numbers> {
         let get = self.get("body", OF_A_BODY, None)?;
         let mut numbers = Numbers::new();
-        for body in self.elements.select(Kind::Body, value)? {
-            let name = self.elements.name(Kind::Body, body);
+        for body in self.elements.select(ElementKind::Body, value)? {
+            let name = self.elements.name(ElementKind::Body, body);
             let mut push = |number, part: &str, suffix: String, unit| {
                 let mut entry = entry(name, part, format!("{name}_{suffix}"), unit);
                 entry.kind = "body";
@@ -202,10 +202,10 @@ impl Source<'_> {
         Ok(numbers)
     }
 
-    fn points(&self, kind: Kind, value: &Value<'_>) -> Result<Numbers> {
-        let known = if kind == Kind::Site { OF_A_SITE } else { OF_A_GEOM };
+    fn points(&self, kind: ElementKind, value: &Value<'_>) -> Result<Numbers> {
+        let known = if kind == ElementKind::Site { OF_A_SITE } else { OF_A_GEOM };
         let get = self.get(kind.name(), known, None)?;
-        let array = if kind == Kind::Site { Array::SitePositions } else { Array::GeomPositions };
+        let array = if kind == ElementKind::Site { Array::SitePositions } else { Array::GeomPositions };
         let mut numbers = Numbers::new();
         for id in self.elements.select(kind, value)? {
             let name = self.elements.name(kind, id);
@@ -226,8 +226,8 @@ impl Source<'_> {
 
     fn centre(&self, value: &Value<'_>) -> Result<Numbers> {
         self.no_get("com")?;
-        let bodies = self.elements.select(Kind::Body, value)?;
-        let mass: f64 = bodies.iter().map(|&body| self.model.field(Field::BodyMass)[body]).sum();
+        let bodies = self.elements.select(ElementKind::Body, value)?;
+        let mass: f64 = bodies.iter().map(|&body| self.model.field(ModelField::BodyMass)[body]).sum();
         if mass <= 0.0 {
             return Err(value.error("these bodies have no mass, so they have no centre of mass"));
         }
@@ -253,23 +253,23 @@ impl Source<'_> {
     }
 
     /// Reads a point, written for instance `{ body = "name" }`.
-    fn point(&self, value: &Value<'_>) -> Result<Point> {
+    fn point(&self, value: &Value<'_>) -> Result<PointSource> {
         let table = value.table()?;
         table.only(&["body", "site", "geom"])?;
         let (kind, name) = table.one_of(&["body", "site", "geom"])?;
         let (kind, array) = match kind {
-            "body" => (Kind::Body, Array::BodyPositions),
-            "site" => (Kind::Site, Array::SitePositions),
-            _ => (Kind::Geom, Array::GeomPositions),
+            "body" => (ElementKind::Body, Array::BodyPositions),
+            "site" => (ElementKind::Site, Array::SitePositions),
+            _ => (ElementKind::Geom, Array::GeomPositions),
         };
-        Ok(Point { array, id: self.elements.find(kind, &name)? })
+        Ok(PointSource { array, id: self.elements.find(kind, &name)? })
     }
 
     fn sensors(&self, value: &Value<'_>) -> Result<Numbers> {
         self.no_get("a sensor")?;
         let mut numbers = Numbers::new();
-        for sensor in self.elements.select(Kind::Sensor, value)? {
-            let name = self.elements.name(Kind::Sensor, sensor);
+        for sensor in self.elements.select(ElementKind::Sensor, value)? {
+            let name = self.elements.name(ElementKind::Sensor, sensor);
             let first = self.model.index_array(Index::SensorAddress)[sensor] as usize;
             let length = self.model.index_array(Index::SensorDimension)[sensor] as usize;
             for i in 0..length {
@@ -287,7 +287,7 @@ impl Source<'_> {
         let get = self.get("actuator", OF_AN_ACTUATOR, None)?;
         let model = self.model;
         let mut numbers = Numbers::new();
-        for actuator in self.elements.select(Kind::Actuator, value)? {
+        for actuator in self.elements.select(ElementKind::Actuator, value)? {
             let name = actuator_name(model, self.elements, actuator);
             let number = match get {
                 "control" => Number::Array(Array::Controls, actuator, 1),
@@ -315,7 +315,7 @@ impl Source<'_> {
             let number = if previous { Number::PreviousAction(actuator) } else { Number::Action(actuator) };
             (number, entry(&name, "", format!("{prefix}_{name}"), "1"))
         };
-        Ok(self.elements.select(Kind::Actuator, value)?.into_iter().map(number).collect())
+        Ok(self.elements.select(ElementKind::Actuator, value)?.into_iter().map(number).collect())
     }
 
     /// Removes all numbers except the components along the axes in a text such as "xz".
@@ -326,7 +326,7 @@ impl Source<'_> {
         if text.is_empty() || text.chars().any(|c| !"xyz".contains(c)) {
             return Err(wrong());
         }
-        let axis = |entry: &Entry| entry.name.rsplit_once('.').map(|(_, axis)| axis.to_owned());
+        let axis = |entry: &NumberDescription| entry.name.rsplit_once('.').map(|(_, axis)| axis.to_owned());
         if !all.iter().any(|(_, entry)| axis(entry).is_some_and(|axis| AXES.contains(&axis.as_str()))) {
             return Err(axes.error("what is read has no axes; leave them out"));
         }

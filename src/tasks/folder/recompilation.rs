@@ -5,7 +5,7 @@ use super::{
     lengths::{EditedText, Slot},
     mjcf::{Mjcf, escaped_reason},
     parameter::EditedParameter,
-    table::Table,
+    table::TomlTable,
 };
 use perturb_mujoco::{Error, Model};
 use std::{
@@ -46,7 +46,7 @@ impl Recompilation {
     /// # Errors
     /// [`super::Error`] with the parameter and the value, if the text cannot be edited or the model cannot be compiled.
     pub(super) fn new(
-        tables: &[Table<'_>],
+        tables: &[TomlTable<'_>],
         parameters: &[EditedParameter],
         mjcf: &Mjcf,
         model: &Model,

@@ -2,14 +2,16 @@
 
 use super::{
     effect,
-    environment::{Poses, Task},
+    environment::{FolderTask, Poses},
     error::{Error, LoadError},
     files::Files,
-    load::{Folder, load},
+    load::{TaskFolder, load},
     recompilation::Recompilation,
 };
-use crate::env::{Action, ActionSpace, Channel, Episodes, Parameter, Purpose, Settings, Stream, Version};
-use perturb_mujoco::Kind;
+use crate::env::{
+    Action, ActionSpec, ChannelSpec, DrawPurpose, EpisodeSettings, Episodes, ParameterSpec, PhiloxStream, Version,
+};
+use perturb_mujoco::ElementKind;
 use std::{fmt::Write, path::Path, time::Duration};
 use tokio::time::Instant;
 
@@ -20,7 +22,7 @@ const N_COMPILATIONS: u32 = 9;
 /// Maximal number of names in a list of the report. Longer lists are shortened.
 const MAX_LISTED: usize = 24;
 
-impl Folder {
+impl TaskFolder {
     /// Returns the names of the parameters that have no visible effect in a short simulation from the initial state.
     ///
     /// # Errors
@@ -53,7 +55,12 @@ pub fn report(path: &Path, measured: bool) -> Result<String, LoadError> {
 
 /// Writes the line about parameters that edit lengths: their names, the time of a compilation, and the memory of a
 /// model.
-fn lengths(out: &mut String, task: &Task, recompilation: &Recompilation, time: Option<Duration>) -> std::fmt::Result {
+fn lengths(
+    out: &mut String,
+    task: &FolderTask,
+    recompilation: &Recompilation,
+    time: Option<Duration>,
+) -> std::fmt::Result {
     let names: Vec<&str> = recompilation.parameters(&task.parameters).collect();
     let kilobytes = task.template.model.model_bytes() / 1000;
     let time = time.map_or(String::new(), |time| format!(", {:.2} ms", 1e3 * time.as_secs_f64()));
@@ -66,11 +73,11 @@ fn lengths(out: &mut String, task: &Task, recompilation: &Recompilation, time: O
 
 /// Measures the median time to compile the model with edited lengths. The parameters are near the upper ends of version
 /// E.
-fn compilation_time(task: &Task, recompilation: &Recompilation) -> Result<Duration, perturb_mujoco::Error> {
+fn compilation_time(task: &FolderTask, recompilation: &Recompilation) -> Result<Duration, perturb_mujoco::Error> {
     let mut times = Vec::new();
     for i in 1..=N_COMPILATIONS {
         let share = 1.0 - f64::from(i) * 1e-6; // gives values that are not in the cache
-        let value = |parameter: &Parameter| {
+        let value = |parameter: &ParameterSpec| {
             let high = parameter.extreme[1].high;
             parameter.default + share * (high - parameter.default)
         };
@@ -84,7 +91,13 @@ fn compilation_time(task: &Task, recompilation: &Recompilation) -> Result<Durati
 }
 
 /// Writes all of the report except the line about lengths.
-fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial: Option<Trial>) -> std::fmt::Result {
+fn describe(
+    out: &mut String,
+    task: &FolderTask,
+    files: &Files,
+    unseen: &[&str],
+    trial: Option<Trial>,
+) -> std::fmt::Result {
     let (spec, model) = (&task.spec, &task.template.model);
     let names: Vec<&str> = files.names().collect();
     writeln!(out, "{}: {}", spec.name, spec.description)?;
@@ -98,7 +111,7 @@ fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial
         model.n_v(),
         model.n_geom(),
         model.n_u(),
-        model.count(Kind::Sensor)
+        model.count(ElementKind::Sensor)
     )?;
     writeln!(
         out,
@@ -108,9 +121,10 @@ fn describe(out: &mut String, task: &Task, files: &Files, unseen: &[&str], trial
         spec.step_limit,
         if task.poses == Poses::Before { "those before the last timestep" } else { "those after the step" }
     )?;
-    let channels = |channels: &[Channel]| shortened(&channels.iter().map(|channel| channel.name).collect::<Vec<_>>());
+    let channels =
+        |channels: &[ChannelSpec]| shortened(&channels.iter().map(|channel| channel.name).collect::<Vec<_>>());
     writeln!(out, "  observation   {} numbers: {}", spec.observation.len(), channels(spec.observation))?;
-    if let ActionSpace::Continuous(actions) = spec.action {
+    if let ActionSpec::Continuous(actions) = spec.action {
         writeln!(out, "  action        {} numbers: {}", actions.len(), channels(actions))?;
     }
     writeln!(out, "  exact state   {} numbers: {}", spec.state.len(), channels(spec.state))?;
@@ -197,14 +211,14 @@ struct Trial {
 }
 
 /// Steps an environment with random actions for the time [`TIMED`].
-fn try_steps(task: &'static Task) -> Result<Trial, crate::env::Error> {
+fn try_steps(task: &'static FolderTask) -> Result<Trial, crate::env::Error> {
     let spec = &task.spec;
     let distributions = spec.distributions(Version::D);
-    let settings = Settings { seed: 0, environment_index: 0, distributions, episodes_per_trial: 1 };
+    let settings = EpisodeSettings { seed: 0, environment_index: 0, distributions, episodes_per_trial: 1 };
     let mut episodes = Episodes::new((spec.make)()?, settings);
     let mut trial = Trial { steps_per_second: 0.0, episodes: 0, diverged: 0 };
-    let ActionSpace::Continuous(channels) = spec.action else { return Ok(trial) };
-    let mut stream = Stream::new(1, 0, Purpose::InitialState, 0);
+    let ActionSpec::Continuous(channels) = spec.action else { return Ok(trial) };
+    let mut stream = PhiloxStream::new(1, 0, DrawPurpose::InitialState, 0);
     let mut terms = vec![0.0; spec.reward_terms.len()];
     let mut action = vec![0.0; channels.len()];
     let (start, mut steps) = (Instant::now(), 0.0);

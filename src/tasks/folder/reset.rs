@@ -7,10 +7,10 @@
 use super::{
     elements::Elements,
     error::Result,
-    table::{Table, Value},
+    table::{TomlTable, Value},
 };
-use crate::env::Stream;
-use perturb_mujoco::{Field, Index, Kind, Model};
+use crate::env::PhiloxStream;
+use perturb_mujoco::{ElementKind, Index, Model, ModelField};
 use std::f64::consts::TAU;
 
 const RESET: &[&str] = &["keyframe", "position", "velocity", "joints"];
@@ -48,7 +48,7 @@ enum Placement {
 
 /// The distribution of initial states.
 #[derive(Debug, Clone)]
-pub(super) struct Reset {
+pub(super) struct InitialStateDistribution {
     /// The positions, then the velocities, without noise.
     base: Vec<f64>,
     /// The indices in `base` of the numbers with noise, and their noise.
@@ -57,24 +57,24 @@ pub(super) struct Reset {
     placed: Vec<(Vec<usize>, Placement)>,
 }
 
-impl Reset {
+impl InitialStateDistribution {
     /// Reads the distribution from the TOML table `reset`. Without a table, the state is the model's initial state.
-    pub(super) fn new(table: Option<&Table<'_>>, model: &Model, elements: &Elements) -> Result<Self> {
+    pub(super) fn new(table: Option<&TomlTable<'_>>, model: &Model, elements: &Elements) -> Result<Self> {
         let (n_q, n_v) = (model.n_q(), model.n_v());
-        let mut base = [model.field(Field::InitialPositions), &vec![0.0; n_v]].concat();
+        let mut base = [model.field(ModelField::InitialPositions), &vec![0.0; n_v]].concat();
         let Some(table) = table else { return Ok(Self { base, noise: Vec::new(), placed: Vec::new() }) };
         table.only(RESET)?;
         if let Some(value) = table.get("keyframe") {
-            let key = elements.find(Kind::Keyframe, &value)?;
-            base[..n_q].copy_from_slice(&model.field(Field::KeyPositions)[key * n_q..][..n_q]);
-            base[n_q..].copy_from_slice(&model.field(Field::KeyVelocities)[key * n_v..][..n_v]);
+            let key = elements.find(ElementKind::Keyframe, &value)?;
+            base[..n_q].copy_from_slice(&model.field(ModelField::KeyPositions)[key * n_q..][..n_q]);
+            base[n_q..].copy_from_slice(&model.field(ModelField::KeyVelocities)[key * n_v..][..n_v]);
         }
         // Joints that are placed by rules. `taken` marks their numbers.
         let mut placed = Vec::new();
         let mut taken = vec![false; n_q + n_v];
         for joints in table.tables("joints")? {
             joints.only(JOINTS)?;
-            let selected = elements.select(Kind::Joint, &joints.require("joint", "\"target_x\"")?)?;
+            let selected = elements.select(ElementKind::Joint, &joints.require("joint", "\"target_x\"")?)?;
             if !joints.has("position") && !joints.has("velocity") {
                 return Err(joints.error("give position, velocity, or both"));
             }
@@ -103,7 +103,7 @@ impl Reset {
     }
 
     /// Draws an initial state, and writes its positions and velocities to `qpos` and `qvel`.
-    pub(super) fn draw(&self, stream: &mut Stream, qpos: &mut [f64], qvel: &mut [f64]) {
+    pub(super) fn draw(&self, stream: &mut PhiloxStream, qpos: &mut [f64], qvel: &mut [f64]) {
         let mut state = self.base.clone();
         for &(number, noise) in &self.noise {
             state[number] += noise.draw(stream);
@@ -129,14 +129,14 @@ fn numbers_of(model: &Model, joint: usize, velocity: bool) -> std::ops::Range<us
 }
 
 impl Noise {
-    fn new(table: &Table<'_>) -> Result<Self> {
+    fn new(table: &TomlTable<'_>) -> Result<Self> {
         table.only(NOISE)?;
         let (key, value) = table.one_of(&["uniform", "normal"])?;
         let size = positive(&value)?;
         Ok(if key == "uniform" { Self::Uniform(size) } else { Self::Normal(size) })
     }
 
-    fn draw(self, stream: &mut Stream) -> f64 {
+    fn draw(self, stream: &mut PhiloxStream) -> f64 {
         match self {
             Self::Uniform(size) => stream.uniform(-size, size),
             Self::Normal(size) => size * normal_quantile(stream.unit()),
@@ -180,7 +180,7 @@ impl Placement {
         }
     }
 
-    fn draw(&self, stream: &mut Stream, numbers: &[usize], state: &mut [f64]) {
+    fn draw(&self, stream: &mut PhiloxStream, numbers: &[usize], state: &mut [f64]) {
         match self {
             Self::Noise(noise) => numbers.iter().for_each(|&number| state[number] += noise.draw(stream)),
             Self::Fixed(value) => numbers.iter().for_each(|&number| state[number] = *value),
@@ -305,7 +305,7 @@ fn normal_quantile(p: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::env::Purpose;
+    use crate::env::DrawPurpose;
 
     #[test]
     fn normal_quantiles_are_those_of_python() {
@@ -325,7 +325,7 @@ mod tests {
 
     #[test]
     fn discs_and_boxes_are_filled_and_kept_to() {
-        let mut stream = Stream::new(1, 2, Purpose::InitialState, 3);
+        let mut stream = PhiloxStream::new(1, 2, DrawPurpose::InitialState, 3);
         let (mut state, mut largest) = ([0.0; 2], 0.0f64);
         for _ in 0..1000 {
             Placement::Disc(0.2).draw(&mut stream, &[0, 1], &mut state);

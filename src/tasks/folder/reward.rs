@@ -3,13 +3,13 @@
 use super::{
     elements::{Elements, actuated_joint},
     error::{Result, escaped},
-    number::{Context, Stage, scaled},
+    number::{Stage, StepActions, scaled},
     reading::Reading,
     rules::leaked,
-    table::{Table, Value},
+    table::{TomlTable, Value},
 };
-use crate::env::RewardTerm;
-use perturb_mujoco::{Flags, Index, Kind, Model, Simulation};
+use crate::env::RewardTermSpec;
+use perturb_mujoco::{ElementKind, Flags, Index, Model, Simulation};
 
 /// The keys of a term that say what kind it is. Each term has exactly one of them.
 pub(super) const KINDS: [&str; 10] =
@@ -40,7 +40,7 @@ const AT_LIMIT: f64 = 0.99;
 /// A term of the reward.
 #[derive(Debug, Clone)]
 pub(super) struct Term {
-    pub(super) about: RewardTerm,
+    pub(super) about: RewardTermSpec,
     kind: TermKind,
     weight: f64,
     mean: bool,
@@ -52,7 +52,7 @@ pub(super) struct Term {
 #[derive(Debug, Clone)]
 enum TermKind {
     Value(Reading),
-    /// The change of a reading per second: (reading, index of its first number in [`Step::before`]).
+    /// The change of a reading per second: (reading, index of its first number in [`StepValues::before`]).
     Rate(Reading, usize),
     Squared(Reading),
     Norm(Reading),
@@ -88,8 +88,8 @@ enum MarginShape {
 }
 
 /// The values of a step that terms use in addition to the simulation.
-pub(super) struct Step<'a> {
-    pub(super) context: Context<'a>,
+pub(super) struct StepValues<'a> {
+    pub(super) context: StepActions<'a>,
     pub(super) healthy: bool,
     /// The simulated time of a step, in s.
     pub(super) seconds: f64,
@@ -99,7 +99,7 @@ pub(super) struct Step<'a> {
 
 impl Term {
     /// Reads a term from its TOML table. `n_remembered` is the total of numbers that earlier terms remember.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
         let name = table.require("name", "\"forward\"")?;
         let name = identifier(&name, name.text()?)?;
         let table = &table.clone().at(format!("reward {name}"));
@@ -168,7 +168,7 @@ impl Term {
         };
         let weight = weight.unwrap_or(1.0);
         let mut term = Self {
-            about: RewardTerm { name: leaked(name), description: "" },
+            about: RewardTermSpec { name: leaked(name), description: "" },
             target: target(table, kind.reading())?,
             kind,
             weight,
@@ -246,7 +246,7 @@ impl Term {
     }
 
     /// Computes the term after a step. `numbers` is a buffer that is overwritten.
-    pub(super) fn compute(&self, simulation: &Simulation, step: &Step<'_>, numbers: &mut Vec<f64>) -> f64 {
+    pub(super) fn compute(&self, simulation: &Simulation, step: &StepValues<'_>, numbers: &mut Vec<f64>) -> f64 {
         numbers.clear();
         if let Some(reading) = self.kind.reading() {
             reading.read(simulation, &step.context, numbers);
@@ -330,7 +330,7 @@ impl TermKind {
 }
 
 /// Reads the key `target`: one number for all numbers of the reading, or a list with a number for each.
-fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
+fn target(table: &TomlTable<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
     let Some(value) = table.get("target") else { return Ok(Vec::new()) };
     if !value.is_list() {
         return Ok(vec![value.number()?]);
@@ -351,11 +351,11 @@ fn target(table: &Table<'_>, reading: Option<&Reading>) -> Result<Vec<f64>> {
 fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["actuator"])?;
-    let actuators = elements.select(Kind::Actuator, &table.require("actuator", "\"*\"")?)?;
+    let actuators = elements.select(ElementKind::Actuator, &table.require("actuator", "\"*\"")?)?;
     let place = |actuator| {
         let joint = actuated_joint(model, actuator).filter(|&joint| model.index_array(Index::JointType)[joint] > 1);
         let joint = joint.ok_or_else(|| {
-            let name = escaped(elements.name(Kind::Actuator, actuator));
+            let name = escaped(elements.name(ElementKind::Actuator, actuator));
             value.error(format_args!("actuator {name:?} does not drive a hinge or slide; name those that do"))
         })?;
         Ok((actuator, model.index_array(Index::JointVelocity)[joint] as usize))
@@ -368,7 +368,7 @@ fn power(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(u
 fn limits(value: &Value<'_>, model: &Model, elements: &Elements) -> Result<Vec<(usize, usize)>> {
     let table = value.table()?;
     table.only(&["joint"])?;
-    let joints = elements.select(Kind::Joint, &table.require("joint", "\"*\"")?)?;
+    let joints = elements.select(ElementKind::Joint, &table.require("joint", "\"*\"")?)?;
     let limited =
         |&joint: &usize| model.flags(Flags::JointLimited)[joint] != 0 && model.index_array(Index::JointType)[joint] > 1;
     let places: Vec<(usize, usize)> = joints

@@ -3,11 +3,11 @@
 use super::{
     elements::Elements,
     error::Result,
-    number::{Context, unique_channels},
+    number::{StepActions, unique_channels},
     reading::Reading,
-    table::{Table, Value},
+    table::{TomlTable, Value},
 };
-use crate::env::{Achievement, Comparison, Quantity, Success};
+use crate::env::{Achievement, QuantitySpec, SuccessComparison, SuccessRuleSpec};
 use perturb_mujoco::{Model, Simulation};
 
 const RANGE: &[&str] = &["of", "above", "below", "from", "to"];
@@ -39,7 +39,7 @@ pub(super) struct Range {
 
 impl Range {
     /// Reads a range from its TOML table.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements) -> Result<Self> {
         table.only(RANGE)?;
         let of = table.require("of", "{ joint = \"root\", get = \"position\" }")?.table()?;
         let range = Self {
@@ -65,7 +65,7 @@ impl Range {
     }
 
     /// Reads a list of ranges from their TOML tables.
-    pub(super) fn list(tables: &[Table<'_>], model: &Model, elements: &Elements) -> Result<Vec<Self>> {
+    pub(super) fn list(tables: &[TomlTable<'_>], model: &Model, elements: &Elements) -> Result<Vec<Self>> {
         tables.iter().map(|table| Self::new(table, model, elements)).collect()
     }
 
@@ -75,7 +75,7 @@ impl Range {
     }
 
     /// Whether all numbers of the reading are finite and lie in the range. `numbers` is a buffer that is overwritten.
-    pub(super) fn holds(&self, simulation: &Simulation, context: &Context<'_>, numbers: &mut Vec<f64>) -> bool {
+    pub(super) fn holds(&self, simulation: &Simulation, context: &StepActions<'_>, numbers: &mut Vec<f64>) -> bool {
         numbers.clear();
         self.reading.read(simulation, context, numbers);
         numbers.iter().all(|&x| {
@@ -103,18 +103,18 @@ pub(super) struct Goal {
     pub(super) achieved: Option<(Best, Reading)>,
     /// The conditions of the goal, if the rule counts steps at which the goal is met; otherwise empty.
     pub(super) ranges: Vec<Range>,
-    pub(super) rule: Success,
+    pub(super) rule: SuccessRuleSpec,
 }
 
 impl Goal {
     /// Reads the success rule from the TOML table `success`, for episodes of at most `step_limit` steps.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, step_limit: u32) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements, step_limit: u32) -> Result<Self> {
         table.only(SUCCESS)?;
         let description = table.require("description", "\"the torso came 10 m far\"")?.text()?;
         let (key, value) = table.one_of(&ACHIEVEMENTS)?;
         let (comparison, threshold) = match (table.number("at_least")?, table.number("at_most")?) {
-            (Some(threshold), None) => (Comparison::AtLeast, threshold),
-            (None, Some(threshold)) => (Comparison::AtMost, threshold),
+            (Some(threshold), None) => (SuccessComparison::AtLeast, threshold),
+            (None, Some(threshold)) => (SuccessComparison::AtMost, threshold),
             _ => return Err(table.error("give at_least or at_most: the number that the achieved one is compared with")),
         };
         // The key says what the rule compares: steps, steps at which ranges hold, or the best value of a reading.
@@ -122,7 +122,12 @@ impl Goal {
         let mut goal = Self {
             achieved: None,
             ranges: Vec::new(),
-            rule: Success { description: leaked(description), achievement: Achievement::Length, comparison, threshold },
+            rule: SuccessRuleSpec {
+                description: leaked(description),
+                achievement: Achievement::Length,
+                comparison,
+                threshold,
+            },
         };
         goal.rule.achievement = match key {
             "steps" if !value.flag()? => {
@@ -146,8 +151,10 @@ impl Goal {
                     Some(name) => name.to_owned(),
                     None => unique_channels([entry].into_iter()).concat(),
                 };
-                let quantity =
-                    Quantity { name: leaked(&name), unit: table.text("unit")?.map_or(entry.unit, |unit| leaked(unit)) };
+                let quantity = QuantitySpec {
+                    name: leaked(&name),
+                    unit: table.text("unit")?.map_or(entry.unit, |unit| leaked(unit)),
+                };
                 let best = match key {
                     "greatest" => Best::Greatest,
                     "least" => Best::Least,

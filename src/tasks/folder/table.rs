@@ -14,7 +14,7 @@ pub(super) const FILE: &str = "task.toml";
 /// A table of the file. `place` names it in error messages, such as `parameter friction`; it is empty for the top-level
 /// table.
 #[derive(Clone)]
-pub(super) struct Table<'a> {
+pub(super) struct TomlTable<'a> {
     text: &'a str,
     entries: &'a DeTable<'a>,
     pub(super) place: String,
@@ -65,7 +65,7 @@ fn error(text: &str, offset: usize, place: &str, problem: impl std::fmt::Display
     }
 }
 
-impl<'a> Table<'a> {
+impl<'a> TomlTable<'a> {
     /// The top-level table of a document with this text.
     pub(super) fn top(text: &'a str, document: &'a Spanned<DeTable<'a>>) -> Self {
         Self { text, entries: document.get_ref(), place: String::new(), span: 0..0 }
@@ -141,7 +141,7 @@ impl<'a> Table<'a> {
     }
 
     /// Returns the list of tables of a key; empty if the key is absent. Errors name the tables `key[i]`.
-    pub(super) fn tables(&self, key: &str) -> Result<Vec<Table<'a>>> {
+    pub(super) fn tables(&self, key: &str) -> Result<Vec<TomlTable<'a>>> {
         self.get(key).map_or(Ok(Vec::new()), |value| value.tables())
     }
 }
@@ -195,9 +195,9 @@ impl<'a> Value<'a> {
     }
 
     /// Returns the value as a table.
-    pub(super) fn table(&self) -> Result<Table<'a>> {
+    pub(super) fn table(&self) -> Result<TomlTable<'a>> {
         let entries = self.value.as_table().ok_or_else(|| self.wrong("a table, as { key = value }"))?;
-        Ok(Table { text: self.text, entries, place: self.place.clone(), span: self.span.clone() })
+        Ok(TomlTable { text: self.text, entries, place: self.place.clone(), span: self.span.clone() })
     }
 
     /// Returns the elements of a list. Errors name them `key[i]`.
@@ -213,7 +213,7 @@ impl<'a> Value<'a> {
     }
 
     /// Returns the value as a list of tables.
-    pub(super) fn tables(&self) -> Result<Vec<Table<'a>>> {
+    pub(super) fn tables(&self) -> Result<Vec<TomlTable<'a>>> {
         self.list()?.iter().map(Value::table).collect()
     }
 

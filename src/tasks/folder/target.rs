@@ -3,18 +3,18 @@
 use super::{
     elements::{Elements, actuator_name},
     error::{Error, Result, escaped},
-    table::{Table, Value},
+    table::{TomlTable, Value},
 };
-use perturb_mujoco::{Field, Flags, Index, Kind, Model, Simulation};
+use perturb_mujoco::{ElementKind, Flags, Index, Model, ModelField, Simulation};
 
 /// The editable elements: the key in the file, the kind, and the editable fields.
-pub(super) const EDITABLE: [(&str, Kind, &[&str]); 6] = [
-    ("body", Kind::Body, &["mass", "length", "size", "position"]),
-    ("geom", Kind::Geom, &["friction", "friction_torsion", "friction_roll", "radius"]),
-    ("pair", Kind::Pair, &["friction"]),
-    ("joint", Kind::Joint, &["damping", "armature", "frictionloss", "stiffness", "range"]),
-    ("actuator", Kind::Actuator, &["gear", "kp", "kv", "forcerange"]),
-    ("tendon", Kind::Tendon, &["stiffness", "damping"]),
+pub(super) const EDITABLE: [(&str, ElementKind, &[&str]); 6] = [
+    ("body", ElementKind::Body, &["mass", "length", "size", "position"]),
+    ("geom", ElementKind::Geom, &["friction", "friction_torsion", "friction_roll", "radius"]),
+    ("pair", ElementKind::Pair, &["friction"]),
+    ("joint", ElementKind::Joint, &["damping", "armature", "frictionloss", "stiffness", "range"]),
+    ("actuator", ElementKind::Actuator, &["gear", "kp", "kv", "forcerange"]),
+    ("tendon", ElementKind::Tendon, &["stiffness", "damping"]),
 ];
 /// The options of the model that can be edited.
 pub(super) const OPTIONS: &[&str] = &["gravity", "wind", "density", "viscosity"];
@@ -32,13 +32,13 @@ const N_GEAR: usize = 6;
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Target {
     /// A single number: (array, index).
-    Number(Field, usize),
+    Number(ModelField, usize),
     /// Two consecutive numbers that get the same value: (array, index of the first).
-    Twins(Field, usize),
+    Twins(ModelField, usize),
     /// Both ends of a range that is symmetric about 0: (array, index of the lower end). The value is the upper end.
-    Symmetric(Field, usize),
+    Symmetric(ModelField, usize),
     /// Both ends of a range, which are scaled together: (array, index of the lower end).
-    Ends(Field, usize),
+    Ends(ModelField, usize),
     /// The mass of a body. Its inertia changes in proportion.
     Mass(usize),
     /// The first number of an actuator's gear. The other numbers change in proportion.
@@ -84,7 +84,7 @@ pub(super) enum Change {
 
 impl Targets {
     /// Reads the targets of an edit from its TOML table.
-    pub(super) fn new(table: &Table<'_>, model: &Model, elements: &Elements, change: Change) -> Result<Self> {
+    pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements, change: Change) -> Result<Self> {
         let subjects = ["body", "geom", "pair", "joint", "actuator", "tendon", "option"];
         let (subject, value) = table.one_of(&subjects)?;
         if subject == "option" {
@@ -112,7 +112,7 @@ impl Targets {
         let mut all = Vec::new();
         for &id in &ids {
             let shown = match kind {
-                Kind::Actuator => actuator_name(model, elements, id),
+                ElementKind::Actuator => actuator_name(model, elements, id),
                 _ => elements.name(kind, id).to_owned(),
             };
             let refuse = |problem: &str| value.error(format_args!("{subject} {:?} {problem}", escaped(&shown)));
@@ -134,21 +134,21 @@ impl Targets {
                     let refused = || refuse("is no sphere, capsule or cylinder, so it has no radius");
                     all.push(radius(model, id).ok_or_else(refused)?);
                 }
-                ("geom", _) => all.push(Target::Number(Field::GeomFriction, 3 * id + friction_column(field))),
-                ("pair", _) => all.push(Target::Twins(Field::PairFriction, 5 * id)),
-                ("joint", "stiffness") => all.push(Target::Number(Field::JointStiffness, id)),
-                ("joint", "range") => all.push(range(table, Field::JointRange, 2 * id, change)?),
+                ("geom", _) => all.push(Target::Number(ModelField::GeomFriction, 3 * id + friction_column(field))),
+                ("pair", _) => all.push(Target::Twins(ModelField::PairFriction, 5 * id)),
+                ("joint", "stiffness") => all.push(Target::Number(ModelField::JointStiffness, id)),
+                ("joint", "range") => all.push(range(table, ModelField::JointRange, 2 * id, change)?),
                 ("joint", _) => {
                     let array = match field {
-                        "damping" => Field::DofDamping,
-                        "armature" => Field::DofArmature,
-                        _ => Field::DofFrictionLoss,
+                        "damping" => ModelField::DofDamping,
+                        "armature" => ModelField::DofArmature,
+                        _ => ModelField::DofFrictionLoss,
                     };
                     all.extend(degrees_of_freedom(model, id).map(|dof| Target::Number(array, dof)));
                 }
-                ("actuator", "forcerange") => all.push(range(table, Field::ActuatorForceRange, 2 * id, change)?),
+                ("actuator", "forcerange") => all.push(range(table, ModelField::ActuatorForceRange, 2 * id, change)?),
                 ("actuator", "gear") => {
-                    let is_zero = model.field(Field::ActuatorGear)[N_GEAR * id] == 0.0;
+                    let is_zero = model.field(ModelField::ActuatorGear)[N_GEAR * id] == 0.0;
                     all.push(if is_zero { Err(refuse("has a gear that begins with 0"))? } else { Target::Gear(id) });
                 }
                 ("actuator", "kp") => {
@@ -157,8 +157,8 @@ impl Targets {
                 ("actuator", _) => {
                     all.push(velocity_gain(model, id).ok_or_else(|| refuse("is no velocity servo, so it has no kv"))?);
                 }
-                (_, "stiffness") => all.push(Target::Number(Field::TendonStiffness, id)),
-                _ => all.push(Target::Number(Field::TendonDamping, id)),
+                (_, "stiffness") => all.push(Target::Number(ModelField::TendonStiffness, id)),
+                _ => all.push(Target::Number(ModelField::TendonDamping, id)),
             }
         }
         let names = ids.iter().map(|&id| elements.name(kind, id).to_owned()).collect();
@@ -171,7 +171,7 @@ impl Targets {
         Ok(targets)
     }
 
-    fn option(table: &Table<'_>, value: &Value<'_>) -> Result<Self> {
+    fn option(table: &TomlTable<'_>, value: &Value<'_>) -> Result<Self> {
         let name = value.text()?;
         let option = OPTIONS.iter().copied().find(|&option| option == name).ok_or_else(|| {
             value.error(format_args!("{:?} is unknown; of options there are {}", escaped(name), OPTIONS.join(", ")))
@@ -188,10 +188,10 @@ impl Targets {
             None => 0,
         };
         let field = match option {
-            "gravity" => Field::Gravity,
-            "wind" => Field::Wind,
-            "density" => Field::Density,
-            _ => Field::Viscosity,
+            "gravity" => ModelField::Gravity,
+            "wind" => ModelField::Wind,
+            "density" => ModelField::Density,
+            _ => ModelField::Viscosity,
         };
         let all = vec![Target::Number(field, axis)];
         Ok(Self { all, subject: "option", field: option, ids: Vec::new(), names: vec![option.to_owned()] })
@@ -211,7 +211,7 @@ impl Targets {
 }
 
 /// Reads the key `axis`: 0 for x, 1 for y, 2 for z.
-fn axis(table: &Table<'_>, of: &str) -> Result<usize> {
+fn axis(table: &TomlTable<'_>, of: &str) -> Result<usize> {
     let axis = table.get("axis").ok_or_else(|| table.error(format_args!("{of} has three axes; give axis = \"z\"")))?;
     let text = axis.text()?;
     let found = ["x", "y", "z"].iter().position(|&known| known == text);
@@ -235,7 +235,7 @@ fn geoms(model: &Model, body: usize) -> impl Iterator<Item = (usize, i32)> + '_ 
 
 fn length(model: &Model, body: usize) -> Option<Target> {
     let long = geoms(model, body).filter(|(_, kind)| matches!(*kind, CAPSULE | CYLINDER)).map(|(geom, _)| geom);
-    let half = |geom: &usize| model.field(Field::GeomSize)[3 * geom + 1];
+    let half = |geom: &usize| model.field(ModelField::GeomSize)[3 * geom + 1];
     // Among equally long geoms the first counts.
     let longest = long.reduce(|a, b| if half(&b) > half(&a) { b } else { a })?;
     (body > 0).then_some(Target::Length(body, longest))
@@ -259,7 +259,7 @@ fn friction_column(field: &str) -> usize {
 }
 
 fn mass(model: &Model, body: usize) -> Option<Target> {
-    (model.field(Field::BodyMass)[body] > 0.0).then_some(Target::Mass(body))
+    (model.field(ModelField::BodyMass)[body] > 0.0).then_some(Target::Mass(body))
 }
 
 /// Returns the indices of a joint's degrees of freedom.
@@ -269,7 +269,7 @@ pub(super) fn degrees_of_freedom(model: &Model, joint: usize) -> std::ops::Range
     starts[joint] as usize..end
 }
 
-fn range(table: &Table<'_>, field: Field, first: usize, change: Change) -> Result<Target> {
+fn range(table: &TomlTable<'_>, field: ModelField, first: usize, change: Change) -> Result<Target> {
     match (table.text("end")?, change) {
         (Some("lower"), _) => Ok(Target::Number(field, first)),
         (Some("upper"), _) => Ok(Target::Number(field, first + 1)),
@@ -286,8 +286,8 @@ fn range(table: &Table<'_>, field: Field, first: usize, change: Change) -> Resul
 const AFFINE: i32 = 1;
 
 fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
-    let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
-    let bias = model.field(Field::ActuatorBias)[N_GAIN * actuator + 1];
+    let gain = model.field(ModelField::ActuatorGain)[N_GAIN * actuator];
+    let bias = model.field(ModelField::ActuatorBias)[N_GAIN * actuator + 1];
     let is_servo = model.index_array(Index::ActuatorGainType)[actuator] == 0
         && model.index_array(Index::ActuatorBiasType)[actuator] == AFFINE
         && gain != 0.0
@@ -296,8 +296,8 @@ fn position_gain(model: &Model, actuator: usize) -> Option<Target> {
 }
 
 fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
-    let gain = model.field(Field::ActuatorGain)[N_GAIN * actuator];
-    let bias = &model.field(Field::ActuatorBias)[N_GAIN * actuator..][..3];
+    let gain = model.field(ModelField::ActuatorGain)[N_GAIN * actuator];
+    let bias = &model.field(ModelField::ActuatorBias)[N_GAIN * actuator..][..3];
     if model.index_array(Index::ActuatorBiasType)[actuator] != AFFINE || bias[2] == 0.0 {
         None
     } else if bias[1] == 0.0 && bias[2] == -gain {
@@ -309,17 +309,19 @@ fn velocity_gain(model: &Model, actuator: usize) -> Option<Target> {
 
 impl Target {
     /// Returns the place of the target's value in the model: the array, and the index of the number in the array.
-    pub(super) fn place(self) -> (Field, usize) {
+    pub(super) fn place(self) -> (ModelField, usize) {
         match self {
             Self::Number(field, at) | Self::Twins(field, at) => (field, at),
             Self::Symmetric(field, at) | Self::Ends(field, at) => (field, at + 1),
-            Self::Mass(body) => (Field::BodyMass, body),
-            Self::Gear(actuator) => (Field::ActuatorGear, N_GEAR * actuator),
-            Self::PositionGain(actuator) | Self::VelocityGain(actuator) => (Field::ActuatorGain, N_GAIN * actuator),
-            Self::ActuatorDamping(actuator) => (Field::ActuatorBias, N_GAIN * actuator + 2),
-            Self::Length(_, geom) => (Field::GeomSize, 3 * geom + 1),
-            Self::Size(_, geom) | Self::Radius(geom) => (Field::GeomSize, 3 * geom),
-            Self::Position(body, axis) => (Field::BodyPosition, 3 * body + axis),
+            Self::Mass(body) => (ModelField::BodyMass, body),
+            Self::Gear(actuator) => (ModelField::ActuatorGear, N_GEAR * actuator),
+            Self::PositionGain(actuator) | Self::VelocityGain(actuator) => {
+                (ModelField::ActuatorGain, N_GAIN * actuator)
+            }
+            Self::ActuatorDamping(actuator) => (ModelField::ActuatorBias, N_GAIN * actuator + 2),
+            Self::Length(_, geom) => (ModelField::GeomSize, 3 * geom + 1),
+            Self::Size(_, geom) | Self::Radius(geom) => (ModelField::GeomSize, 3 * geom),
+            Self::Position(body, axis) => (ModelField::BodyPosition, 3 * body + axis),
         }
     }
 
@@ -329,17 +331,17 @@ impl Target {
     }
 
     /// Returns the arrays that an edit of this target changes, without those that MuJoCo derives from them.
-    pub(super) fn fields(self) -> Vec<Field> {
+    pub(super) fn fields(self) -> Vec<ModelField> {
         match self {
-            Self::Mass(_) => vec![Field::BodyMass, Field::BodyInertia],
-            Self::PositionGain(_) | Self::VelocityGain(_) => vec![Field::ActuatorGain, Field::ActuatorBias],
+            Self::Mass(_) => vec![ModelField::BodyMass, ModelField::BodyInertia],
+            Self::PositionGain(_) | Self::VelocityGain(_) => vec![ModelField::ActuatorGain, ModelField::ActuatorBias],
             _ => vec![self.place().0],
         }
     }
 
     /// Whether MuJoCo must compute derived constants again after an edit, see [`Simulation::set_const`].
     pub(super) fn changes_constants(self) -> bool {
-        matches!(self.place().0, Field::BodyMass | Field::DofArmature | Field::ActuatorGear)
+        matches!(self.place().0, ModelField::BodyMass | ModelField::DofArmature | ModelField::ActuatorGear)
     }
 
     /// Whether the ends of a [`Target::Symmetric`] have the same absolute value. True for other targets.
@@ -375,8 +377,10 @@ impl Target {
             Self::Ends(..) => {}
             Self::Mass(body) => {
                 let factor = value / own;
-                let inertia = &pristine.field(Field::BodyInertia)[3 * body..][..3];
-                for (moment, own) in simulation.field_mut(Field::BodyInertia)[3 * body..][..3].iter_mut().zip(inertia) {
+                let inertia = &pristine.field(ModelField::BodyInertia)[3 * body..][..3];
+                for (moment, own) in
+                    simulation.field_mut(ModelField::BodyInertia)[3 * body..][..3].iter_mut().zip(inertia)
+                {
                     *moment = own * factor;
                 }
             }
@@ -387,8 +391,12 @@ impl Target {
                     *number = own * factor;
                 }
             }
-            Self::PositionGain(actuator) => simulation.field_mut(Field::ActuatorBias)[N_GAIN * actuator + 1] = -value,
-            Self::VelocityGain(actuator) => simulation.field_mut(Field::ActuatorBias)[N_GAIN * actuator + 2] = -value,
+            Self::PositionGain(actuator) => {
+                simulation.field_mut(ModelField::ActuatorBias)[N_GAIN * actuator + 1] = -value
+            }
+            Self::VelocityGain(actuator) => {
+                simulation.field_mut(ModelField::ActuatorBias)[N_GAIN * actuator + 2] = -value
+            }
         }
     }
 
@@ -396,17 +404,17 @@ impl Target {
     pub(super) fn scale(self, pristine: &Model, simulation: &mut Simulation, factor: f64) {
         let (field, at) = self.place();
         let mut multiply =
-            |field: Field, at: usize| simulation.field_mut(field)[at] = pristine.field(field)[at] * factor;
+            |field: ModelField, at: usize| simulation.field_mut(field)[at] = pristine.field(field)[at] * factor;
         multiply(field, at);
         match self {
             Self::Number(..) | Self::ActuatorDamping(_) => {}
             Self::Length(..) | Self::Size(..) | Self::Radius(_) | Self::Position(..) => {} // set by another compilation
             Self::Twins(..) => multiply(field, at + 1),
             Self::Symmetric(..) | Self::Ends(..) => multiply(field, at - 1),
-            Self::Mass(body) => (0..3).for_each(|i| multiply(Field::BodyInertia, 3 * body + i)),
+            Self::Mass(body) => (0..3).for_each(|i| multiply(ModelField::BodyInertia, 3 * body + i)),
             Self::Gear(_) => (1..N_GEAR).for_each(|i| multiply(field, at + i)),
-            Self::PositionGain(actuator) => multiply(Field::ActuatorBias, N_GAIN * actuator + 1),
-            Self::VelocityGain(actuator) => multiply(Field::ActuatorBias, N_GAIN * actuator + 2),
+            Self::PositionGain(actuator) => multiply(ModelField::ActuatorBias, N_GAIN * actuator + 1),
+            Self::VelocityGain(actuator) => multiply(ModelField::ActuatorBias, N_GAIN * actuator + 2),
         }
     }
 
@@ -438,6 +446,6 @@ pub(super) fn is_limited(model: &Model, subject: &str, id: usize) -> bool {
 }
 
 /// Creates the error that an edit cannot have an effect, for the reason `why`.
-pub(super) fn without_effect(table: &Table<'_>, why: impl std::fmt::Display) -> Error {
+pub(super) fn without_effect(table: &TomlTable<'_>, why: impl std::fmt::Display) -> Error {
     table.error(format_args!("it has no effect: {why}"))
 }

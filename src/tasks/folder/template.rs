@@ -2,7 +2,7 @@
 
 use super::{parameter::EditedParameter, recompilation::Recompilation, target::Target};
 use crate::tasks::shared;
-use perturb_mujoco::{Error, Field, Model, Simulation};
+use perturb_mujoco::{Error, Model, ModelField, Simulation};
 use std::sync::Arc;
 
 /// The compiled model of a folder, which is never modified, and the data for editing simulations of it.
@@ -12,12 +12,12 @@ pub(super) struct Template {
     /// The model's initial [state](Simulation::state).
     pub(super) state: Vec<f64>,
     /// The fields that the parameters edit, and the fields that MuJoCo derives from them.
-    fields: Vec<Field>,
+    fields: Vec<ModelField>,
     /// The edits of lengths; `None` if no parameter edits a length.
     pub(super) recompilation: Option<Recompilation>,
     /// Whether MuJoCo must compute derived fields after an edit.
     derives: bool,
-    /// The indices in [`Field::Statistic`] of the numbers that the model's text sets, which edits must not change.
+    /// The indices in [`ModelField::Statistic`] of the numbers that the model's text sets, which edits must not change.
     statistic: Vec<usize>,
 }
 
@@ -53,7 +53,7 @@ impl Template {
         let edited = || parameters.iter().flat_map(EditedParameter::targets);
         let targets = || edited().filter(|target| !target.is_recompiled());
         self.derives = targets().any(Target::changes_constants);
-        let derived = if self.derives { &Field::DERIVED[..] } else { &[] };
+        let derived = if self.derives { &ModelField::DERIVED[..] } else { &[] };
         self.fields.clear();
         for field in targets().flat_map(Target::fields).chain(derived.iter().copied()) {
             if !self.fields.contains(&field) {
@@ -108,7 +108,7 @@ impl Template {
             if self.derives {
                 simulation.set_const()?;
                 for &entry in &self.statistic {
-                    simulation.field_mut(Field::Statistic)[entry] = pristine.field(Field::Statistic)[entry];
+                    simulation.field_mut(ModelField::Statistic)[entry] = pristine.field(ModelField::Statistic)[entry];
                 }
             }
         }

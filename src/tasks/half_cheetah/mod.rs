@@ -6,7 +6,7 @@ use super::locomotion::{
     colours::*,
 };
 use crate::{
-    env::{ActionSpace, EnvironmentSpec, Error},
+    env::{ActionSpec, EnvironmentSpec, Error},
     scene::{Look, ModelView, Scenery},
 };
 use std::sync::OnceLock;
@@ -34,7 +34,7 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     make: &|| Ok(Box::new(half_cheetah()?)),
     parameters: &[power(0.9, (0.7, 1.1), (0.5, 1.3)), DENSITY, FRICTION],
     observation: NAMES.observation,
-    action: ActionSpace::Continuous(NAMES.action),
+    action: ActionSpec::Continuous(NAMES.action),
     state: NAMES.state,
     reward_terms: REWARD_TERMS,
     applied: APPLIED,

@@ -3,7 +3,7 @@
 //! The arrays of an edited model equal those of a model compiled from edited MJCF up to 4e-13. An edit costs a
 //! hundredth of a compilation.
 
-use perturb_mujoco::{Error, Kind, Model, Simulation};
+use perturb_mujoco::{ElementKind, Error, Model, Simulation};
 
 /// The torso's density in the MJCF, in kg/m³.
 const COMPILED_DENSITY: f64 = 1000.0;
@@ -68,9 +68,9 @@ impl RobotEdit {
 impl EditedElements {
     pub(super) fn new(model: &Model) -> Result<Self, Error> {
         Ok(Self {
-            torso_body: model.id(Kind::Body, "torso")?,
-            torso_geom: model.id(Kind::Geom, "torso")?,
-            floor: model.id(Kind::Geom, "floor")?,
+            torso_body: model.id(ElementKind::Body, "torso")?,
+            torso_geom: model.id(ElementKind::Geom, "torso")?,
+            floor: model.id(ElementKind::Geom, "floor")?,
         })
     }
 

@@ -5,7 +5,7 @@ use super::{
     model_edit::{EditedElements, RobotEdit},
 };
 use crate::tasks::shared::{self, SharedModel};
-use perturb_mujoco::{Error, Kind, Model, Simulation};
+use perturb_mujoco::{ElementKind, Error, Model, Simulation};
 use sha2::{Digest, Sha256};
 use std::{fmt::Write, sync::Arc};
 
@@ -62,17 +62,21 @@ impl Pristine {
             .zip(model.joint_range())
             .map(|((qpos, dof), (low, high))| Joint { qpos, dof, low, high })
             .collect();
-        let joints =
-            robot.names.joints.iter().map(|name| Ok(all[model.id(Kind::Joint, name)?])).collect::<Result<_, _>>()?;
+        let joints = robot
+            .names
+            .joints
+            .iter()
+            .map(|name| Ok(all[model.id(ElementKind::Joint, name)?]))
+            .collect::<Result<_, _>>()?;
         let mut flag_of_geom = vec![None; model.n_geom()];
         for (flag, name) in robot.names.contacts.iter().enumerate() {
-            flag_of_geom[model.id(Kind::Geom, name)?] = Some(flag);
+            flag_of_geom[model.id(ElementKind::Geom, name)?] = Some(flag);
         }
         let hash = Sha256::digest(robot.look.mjcf).iter().fold(String::new(), |mut hex, byte| {
             let _ = write!(hex, "{byte:02x}"); // writing to a String cannot fail
             hex
         });
-        let (targets, torso) = (EditedElements::new(&model)?, model.id(Kind::Body, "torso")?);
+        let (targets, torso) = (EditedElements::new(&model)?, model.id(ElementKind::Body, "torso")?);
         let (mut constants, mut state) = (vec![0.0; model.n_constants()], vec![0.0; model.n_state()]);
         let simulation = Simulation::new(model.try_clone()?)?;
         simulation.constants(&mut constants);

@@ -7,7 +7,7 @@ use super::{
     pristine::{MAX_JOINTS, MAX_STATE, Pristine},
 };
 use crate::{
-    env::{Action, Environment, EnvironmentSpec, Error, Stream, Transition},
+    env::{Action, Environment, EnvironmentSpec, Error, PhiloxStream, Transition},
     scene::{PosedModel, Scene},
     tasks::shared,
 };
@@ -309,7 +309,7 @@ impl Environment for Walker {
         self.push = Some(impulse.map(|impulse| impulse / CONTROL_TIMESTEP));
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.clear();
         let joints = &self.pristine.joints;
         let (qpos, _) = self.positions_mut();

@@ -1,10 +1,10 @@
 //! The picture of MountainCar: a car on the road between two hills, and the flag that it has to reach.
 
 use super::{GOAL_POSITION, MAX_POSITION, MIN_POSITION};
-use crate::scene::{Drawing, Graph, Point, colour, polar};
+use crate::scene::{Drawing, Graph, ScenePoint, colour, polar};
 use std::f64::consts::FRAC_PI_2;
 
-const CAR: Point = [0.09, 0.075]; // half length, height
+const CAR: ScenePoint = [0.09, 0.075]; // half length, height
 const WHEEL: f64 = 0.03;
 
 #[expect(clippy::disallowed_methods, reason = "a picture need not be the same everywhere")]

@@ -7,15 +7,15 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream,
+        PushSpec, QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::Scene,
 };
 
-const STATE: &[Channel] = &[
-    Channel::new("position", "m", MIN_POSITION, MAX_POSITION),
-    Channel::new("velocity", "m/step", -MAX_SPEED, MAX_SPEED),
+const STATE: &[ChannelSpec] = &[
+    ChannelSpec::new("position", "m", MIN_POSITION, MAX_POSITION),
+    ChannelSpec::new("velocity", "m/step", -MAX_SPEED, MAX_SPEED),
 ];
 
 /// The specification of MountainCar.
@@ -25,30 +25,30 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Swing an underpowered car up a hill.",
     make: &|| Ok(Box::new(MountainCar::new())),
     parameters: &[
-        Parameter::new("force", "1", "the engine's push per step", (0.0, 1.0)).versions(
+        ParameterSpec::new("force", "1", "the engine's push per step", (0.0, 1.0)).versions(
             0.001,
             (0.0005, 0.005),
             (0.0001, 0.01),
         ),
-        Parameter::new("mass", "1", "the gravity term's factor", (0.0, 1.0)).versions(
+        ParameterSpec::new("mass", "1", "the gravity term's factor", (0.0, 1.0)).versions(
             0.0025,
             (0.001, 0.005),
             (0.0005, 0.01),
         ),
     ],
     observation: STATE,
-    action: ActionSpace::Discrete(&["push_left", "coast", "push_right"]),
+    action: ActionSpec::Discrete(&["push_left", "coast", "push_right"]),
     state: STATE,
-    reward_terms: &[RewardTerm { name: "time", description: "-1 for every step" }],
-    applied: &[Quantity { name: "force", unit: "1" }, Quantity { name: "mass", unit: "1" }],
+    reward_terms: &[RewardTermSpec { name: "time", description: "-1 for every step" }],
+    applied: &[QuantitySpec { name: "force", unit: "1" }, QuantitySpec { name: "mass", unit: "1" }],
     step_limit: 200,
     control_timestep: 1.0,
     step_cost: 0.04,
     push: Some(PushSpec { description: "change of velocity by a push on the car", unit: "1", axes: &[0] }),
-    success: Success {
+    success: SuccessRuleSpec {
         description: "the goal was reached within 110 steps",
         achievement: Achievement::FirstGoal,
-        comparison: Comparison::AtMost,
+        comparison: SuccessComparison::AtMost,
         threshold: 110.0,
     },
     code_success: None,
@@ -104,7 +104,7 @@ impl Environment for MountainCar {
         self.push = impulse;
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.state = [stream.uniform(-0.6, -0.4), 0.0];
     }
 

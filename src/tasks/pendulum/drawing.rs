@@ -2,7 +2,7 @@
 //! of the last step.
 
 use super::{MAX_TORQUE, UPRIGHT};
-use crate::scene::{Drawing, Point, colour, polar};
+use crate::scene::{Drawing, ScenePoint, colour, polar};
 use std::f64::consts::{FRAC_PI_2, PI};
 
 const ROD: f64 = 0.16;
@@ -11,7 +11,7 @@ const MAX_TURN: f64 = 0.75 * PI;
 /// Number of straight segments by which an arc is drawn.
 const SMOOTH: usize = 64;
 
-fn arc(centre: Point, radius: f64, from: f64, to: f64) -> Vec<Point> {
+fn arc(centre: ScenePoint, radius: f64, from: f64, to: f64) -> Vec<ScenePoint> {
     (0..=SMOOTH).map(|i| polar(centre, radius, from + (to - from) * i as f64 / SMOOTH as f64)).collect()
 }
 

@@ -8,8 +8,8 @@ mod drawing;
 use super::analytic;
 use crate::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        PushSpec, Quantity, RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream,
+        PushSpec, QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::Scene,
 };
@@ -22,39 +22,39 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Swing a rod up with a weak torque and hold it upright.",
     make: &|| Ok(Box::new(Pendulum::new())),
     parameters: &[
-        Parameter::new("length", "m", "length of the rod", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
-        Parameter::new("mass", "kg", "mass of the rod", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        ParameterSpec::new("length", "m", "length of the rod", (0.01, 100.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
+        ParameterSpec::new("mass", "kg", "mass of the rod", (0.001, 1000.0)).versions(1.0, (0.75, 1.25), (0.5, 1.5)),
     ],
     observation: &[
-        Channel::new("cos_theta", "1", -1.0, 1.0),
-        Channel::new("sin_theta", "1", -1.0, 1.0),
-        Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
+        ChannelSpec::new("cos_theta", "1", -1.0, 1.0),
+        ChannelSpec::new("sin_theta", "1", -1.0, 1.0),
+        ChannelSpec::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
     ],
-    action: ActionSpace::Continuous(&[Channel::new("torque", "N m", -MAX_TORQUE, MAX_TORQUE)]),
+    action: ActionSpec::Continuous(&[ChannelSpec::new("torque", "N m", -MAX_TORQUE, MAX_TORQUE)]),
     state: &[
-        Channel::new("theta", "rad", -MAX_INITIAL_ANGLE, MAX_INITIAL_ANGLE),
-        Channel::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
+        ChannelSpec::new("theta", "rad", -MAX_INITIAL_ANGLE, MAX_INITIAL_ANGLE),
+        ChannelSpec::new("theta_velocity", "rad/s", -MAX_SPEED, MAX_SPEED),
     ],
     reward_terms: &[
-        RewardTerm { name: "angle", description: "-θ², θ wrapped into [-π, π), before the step" },
-        RewardTerm { name: "velocity", description: "-0.1 θ̇², before the step" },
-        RewardTerm { name: "torque", description: "-0.001 u², u clipped to ±2" },
+        RewardTermSpec { name: "angle", description: "-θ², θ wrapped into [-π, π), before the step" },
+        RewardTermSpec { name: "velocity", description: "-0.1 θ̇², before the step" },
+        RewardTermSpec { name: "torque", description: "-0.001 u², u clipped to ±2" },
     ],
-    applied: &[Quantity { name: "length", unit: "m" }, Quantity { name: "mass", unit: "kg" }],
+    applied: &[QuantitySpec { name: "length", unit: "m" }, QuantitySpec { name: "mass", unit: "kg" }],
     step_limit: STEP_LIMIT,
     control_timestep: DT,
     step_cost: 0.05,
     push: Some(PushSpec { description: "impulse of a push on the joint", unit: "N m s", axes: &[0] }),
-    success: Success {
+    success: SuccessRuleSpec {
         description: "the angle was within π/3 of vertical after each of the last 100 steps",
         achievement: Achievement::LastGoals,
-        comparison: Comparison::AtLeast,
+        comparison: SuccessComparison::AtLeast,
         threshold: 100.0,
     },
-    code_success: Some(Success {
+    code_success: Some(SuccessRuleSpec {
         description: "the angle was within π/3 of vertical after each of 100 successive steps, wherever in the episode",
         achievement: Achievement::LongestGoals,
-        comparison: Comparison::AtLeast,
+        comparison: SuccessComparison::AtLeast,
         threshold: 100.0,
     }),
     heatmap_axes: Some(["mass", "length"]),
@@ -137,7 +137,7 @@ impl Environment for Pendulum {
         self.push = impulse;
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.state = [stream.uniform(-PI, PI), stream.uniform(-1.0, 1.0)];
         self.torque = None;
     }

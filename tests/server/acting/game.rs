@@ -180,9 +180,9 @@ impl Client {
     pub async fn begin(game: Game, server: &Server) -> Self {
         let (session, opened) = Session::open(server.unix(), game.open()).await;
         let role = if game.testing {
-            acting::Role::testing(SEED, game.open().first_environment_index, game.n)
+            acting::PlayerRole::testing(SEED, game.open().first_environment_index, game.n)
         } else {
-            acting::Role::training(SEED)
+            acting::PlayerRole::training(SEED)
         };
         let environment = opened.environment.unwrap();
         let (spec, inputs) = (game.spec(&environment), game.inputs(&environment));

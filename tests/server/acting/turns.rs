@@ -7,7 +7,7 @@ use crate::common::{
 };
 use perturb::{
     env::Version,
-    pool::{Autoreset, Batch, BatchSettings, Policy, PolicyRole, Pool, RolloutRequest, SlotGroup},
+    pool::{Autoreset, Batch, BatchSettings, PolicyRole, Pool, ReceivedPolicy, RolloutRequest, SlotGroupSettings},
     proto::{act::Task as Asked, session_response::Response},
     tasks,
 };
@@ -24,7 +24,7 @@ use std::{
 
 async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
     let spec = tasks::catalogue().find("MountainCar").unwrap();
-    let groups = vec![SlotGroup { size, episodes: common::settings(spec, Version::R, 1, 0, 1) }];
+    let groups = vec![SlotGroupSettings { size, episodes: common::settings(spec, Version::R, 1, 0, 1) }];
     let autoreset = Autoreset::SameStep;
     let settings = BatchSettings {
         spec,
@@ -41,7 +41,7 @@ async fn mountain_cars(pool: &Pool, size: usize) -> Batch {
 /// Returns a request for a rollout that takes seconds: it records only the ends of episodes, so its reply stays small.
 fn endless(size: usize) -> RolloutRequest {
     let spec = PolicySpec::feed_forward(2, ActionKind::Discrete { n: 3 });
-    let policy = Policy {
+    let policy = ReceivedPolicy {
         inputs: Inputs::new(2, spec.action, size, false),
         weights: vec![0.1; spec.n_weights()],
         spec,

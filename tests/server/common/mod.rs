@@ -4,7 +4,8 @@ pub mod proxy;
 pub mod server;
 
 use perturb::env::{
-    Action, ActionSpace, Catalogue, EnvironmentSpec, Episodes, Outcome, Purpose, Settings, Stream, Version,
+    Action, ActionSpec, Catalogue, DrawPurpose, EnvironmentSpec, EpisodeSettings, Episodes, Outcome, PhiloxStream,
+    Version,
 };
 
 /// Returns the folders of examples/tasks, and a variant of the reaching arm whose last parameter is a length.
@@ -57,8 +58,8 @@ pub fn folder_specs() -> Vec<&'static EnvironmentSpec> {
 }
 
 /// Returns settings of an environment in this version.
-pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> Settings {
-    Settings {
+pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32, per_trial: u32) -> EpisodeSettings {
+    EpisodeSettings {
         seed,
         environment_index: index,
         distributions: spec.distributions(version),
@@ -74,10 +75,10 @@ pub fn episodes(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32,
 /// Returns the encoded action of actor number `actor` at time `t`: random, but a function of these two numbers only.
 /// Continuous actions sometimes exceed their ranges, which is allowed.
 pub fn action_bytes(spec: &EnvironmentSpec, actor: u64, t: u64) -> Vec<u8> {
-    let mut stream = Stream::new(0xAC7, actor, Purpose::InitialState, t);
+    let mut stream = PhiloxStream::new(0xAC7, actor, DrawPurpose::InitialState, t);
     match spec.action {
-        ActionSpace::Discrete(names) => ((stream.unit() * names.len() as f64) as i32).to_le_bytes().to_vec(),
-        ActionSpace::Continuous(channels) => {
+        ActionSpec::Discrete(names) => ((stream.unit() * names.len() as f64) as i32).to_le_bytes().to_vec(),
+        ActionSpec::Continuous(channels) => {
             channels.iter().flat_map(|c| (stream.uniform(1.2 * c.low, 1.2 * c.high) as f32).to_le_bytes()).collect()
         }
     }
@@ -92,10 +93,10 @@ pub fn floats(bytes: &[u8]) -> Vec<f32> {
 pub fn step(episodes: &mut Episodes, action: &[u8]) -> (Outcome, Vec<f64>) {
     let mut terms = vec![f64::NAN; episodes.spec().reward_terms.len()];
     let outcome = match episodes.spec().action {
-        ActionSpace::Discrete(_) => {
+        ActionSpec::Discrete(_) => {
             episodes.step(Action::Discrete(u32::from_le_bytes(action.try_into().unwrap())), &mut terms)
         }
-        ActionSpace::Continuous(_) => episodes.step(Action::Continuous(&floats(action)), &mut terms),
+        ActionSpec::Continuous(_) => episodes.step(Action::Continuous(&floats(action)), &mut terms),
     };
     (outcome, terms)
 }

@@ -3,15 +3,15 @@
 use super::{disturbed, settings};
 use crate::common::{self, action_bytes, observe, play, start_line, step};
 use perturb::env::{
-    Action, ActionSpace, Draw, Environment, EnvironmentSpec, Episodes, Parameter, Purpose, Stream, Version,
-    check_distribution, disturbance,
+    Action, ActionSpec, Draw, DrawPurpose, Environment, EnvironmentSpec, Episodes, ParameterSpec, PhiloxStream,
+    Version, check_distribution, disturbance,
 };
 
 const ADDRESS: (u64, u32) = (5, 9);
 
 /// Returns a value for each parameter after a change, different from the value in version D.
 fn changed(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
-    let value = |disturbance: &Parameter| {
+    let value = |disturbance: &ParameterSpec| {
         let [_, above] = disturbance.extreme;
         let is_changed = disturbance.name.starts_with("changed_");
         is_changed.then_some((disturbance.name, 0.5 * (above.low + above.high)))
@@ -42,7 +42,7 @@ impl ByHand {
         let mut environment = (spec.make)().unwrap();
         let defaults: Vec<f64> = spec.parameters.iter().map(|parameter| parameter.default).collect();
         environment.set_parameters(&defaults);
-        environment.reset(&mut Stream::new(ADDRESS.0, ADDRESS.1.into(), Purpose::InitialState, 0));
+        environment.reset(&mut PhiloxStream::new(ADDRESS.0, ADDRESS.1.into(), DrawPurpose::InitialState, 0));
         Self {
             environment,
             sets: [defaults, changed(spec).into_iter().map(|(_, value)| value).collect()],
@@ -68,9 +68,9 @@ impl ByHand {
     }
 }
 
-fn first_stream(step: u32) -> Stream {
+fn first_stream(step: u32) -> PhiloxStream {
     let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 0 };
-    Stream::at_step(&draw, Purpose::Change, step)
+    PhiloxStream::at_step(&draw, DrawPurpose::Change, step)
 }
 
 #[test]
@@ -94,8 +94,8 @@ fn physics_change_where_it_says_and_the_state_goes_over() {
                 let mut terms = vec![0.0; spec.reward_terms.len()];
                 let numbers = common::floats(&bytes);
                 let action = match spec.action {
-                    ActionSpace::Discrete(_) => Action::Discrete(numbers[0].to_bits()),
-                    ActionSpace::Continuous(_) => Action::Continuous(&numbers),
+                    ActionSpec::Discrete(_) => Action::Discrete(numbers[0].to_bits()),
+                    ActionSpec::Continuous(_) => Action::Continuous(&numbers),
                 };
                 episodes.step(action, &mut terms);
                 let expected = by_hand.step(action, is_changed);

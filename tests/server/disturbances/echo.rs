@@ -2,8 +2,8 @@
 
 use perturb::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, PushSpec,
-        RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, PhiloxStream, PushSpec,
+        RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::Scene,
 };
@@ -16,24 +16,27 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     make: &|| Ok(Box::new(Echo { state: [f64::NAN; 6], is_pushed: false })),
     parameters: &[],
     observation: &[
-        Channel::unbounded("left", "1"),
-        Channel::unbounded("right", "1").scale(3.0),
-        Channel::unbounded("steps", "1"),
-        Channel::unbounded("constant", "1").scale(0.0),
-        Channel::unbounded("push_x", "N s").scale(0.0),
-        Channel::unbounded("push_z", "N s").scale(0.0),
+        ChannelSpec::unbounded("left", "1"),
+        ChannelSpec::unbounded("right", "1").scale(3.0),
+        ChannelSpec::unbounded("steps", "1"),
+        ChannelSpec::unbounded("constant", "1").scale(0.0),
+        ChannelSpec::unbounded("push_x", "N s").scale(0.0),
+        ChannelSpec::unbounded("push_z", "N s").scale(0.0),
     ],
-    action: ActionSpace::Continuous(&[Channel::new("left", "1", -1.0, 1.0), Channel::new("right", "1", 0.5, 2.5)]),
+    action: ActionSpec::Continuous(&[
+        ChannelSpec::new("left", "1", -1.0, 1.0),
+        ChannelSpec::new("right", "1", 0.5, 2.5),
+    ]),
     state: &[],
-    reward_terms: &[RewardTerm { name: "left", description: "the left action" }],
+    reward_terms: &[RewardTermSpec { name: "left", description: "the left action" }],
     applied: &[],
     step_limit: 1_000_000,
     control_timestep: 1.0,
     step_cost: 0.1,
-    success: Success {
+    success: SuccessRuleSpec {
         description: "never",
         achievement: Achievement::FirstGoal,
-        comparison: Comparison::AtMost,
+        comparison: SuccessComparison::AtMost,
         threshold: 0.0,
     },
     push: Some(PushSpec { description: "a push", unit: "N s", axes: &[0, 2] }),
@@ -67,7 +70,7 @@ impl Environment for Echo {
         self.is_pushed = true;
     }
 
-    fn reset(&mut self, _: &mut Stream) {
+    fn reset(&mut self, _: &mut PhiloxStream) {
         self.state = [0.0, 0.0, 0.0, CONSTANT.into(), 0.0, 0.0];
     }
 

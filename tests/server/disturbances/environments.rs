@@ -3,7 +3,7 @@
 use super::{all, disturbed, settings};
 use crate::common::{self, action_bytes, episodes, observe, play, start_line, step};
 use perturb::env::{
-    ActionSpace, Distribution, Episodes, Error, Parameter, Version, check_distribution, disturbance, resolve,
+    ActionSpec, Distribution, Episodes, Error, ParameterSpec, Version, check_distribution, disturbance, resolve,
 };
 
 const VERSIONS: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE];
@@ -12,7 +12,7 @@ const VERSIONS: [Version; 4] = [Version::D, Version::R, Version::E, Version::RE]
 fn catalogue_has_no_disturbances_among_parameters() {
     for spec in common::catalogue().specs() {
         let disturbances = disturbance::disturbances(spec);
-        let is_own = |disturbance: &Parameter| spec.parameters.iter().any(|own| own.name == disturbance.name);
+        let is_own = |disturbance: &ParameterSpec| spec.parameters.iter().any(|own| own.name == disturbance.name);
         assert!(!disturbances.iter().any(is_own), "{}", spec.name);
         let twin = disturbance::disturbed(spec);
         assert!(std::ptr::eq(twin, disturbance::disturbed(twin)) && std::ptr::eq((twin.make)().unwrap().spec(), twin));
@@ -34,8 +34,8 @@ fn catalogue_has_no_disturbances_among_parameters() {
         }
         let names: Vec<&str> = disturbances.iter().map(|disturbance| disturbance.name).collect();
         let of_actions: &[&str] = match spec.action {
-            ActionSpace::Discrete(_) => &["action_delay", "action_hold"],
-            ActionSpace::Continuous(_) => &["action_delay", "action_hold", "action_noise", "action_scale"],
+            ActionSpec::Discrete(_) => &["action_delay", "action_hold"],
+            ActionSpec::Continuous(_) => &["action_delay", "action_hold", "action_noise", "action_scale"],
         };
         assert_eq!(&names[..of_actions.len()], of_actions, "{}", spec.name);
         let mut others: Vec<String> =

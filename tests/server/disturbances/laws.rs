@@ -2,7 +2,7 @@
 
 use super::{disturbed, echo};
 use crate::common::observe;
-use perturb::env::{Action, Draw, Episodes, Purpose, Stream, Version};
+use perturb::env::{Action, Draw, DrawPurpose, Episodes, PhiloxStream, Version};
 
 /// The number of draws for the test of a distribution.
 const DRAWS: u32 = 100_000;
@@ -36,13 +36,13 @@ fn acted(episodes: &mut Episodes, steps: u32, action: impl Fn(u32) -> [f32; 2]) 
 }
 
 /// Returns the random stream of a step of the first episode.
-fn stream(purpose: Purpose, step: u32) -> Stream {
+fn stream(purpose: DrawPurpose, step: u32) -> PhiloxStream {
     let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 0 };
-    Stream::at_step(&draw, purpose, step)
+    PhiloxStream::at_step(&draw, purpose, step)
 }
 
 /// Returns the first normal numbers of the stream of a step of the first episode.
-fn normals<const N: usize>(purpose: Purpose, step: u32) -> [f64; N] {
+fn normals<const N: usize>(purpose: DrawPurpose, step: u32) -> [f64; N] {
     let mut stream = stream(purpose, step);
     std::array::from_fn(|_| stream.normal())
 }
@@ -87,7 +87,7 @@ const NUMPY: ([f64; 4], f64, f64) = (
 #[test]
 fn normal_numbers_are_those_of_numpy() {
     let draw = Draw { seed: ADDRESS.0, environment_index: ADDRESS.1, episode_index: 3 };
-    let mut stream = Stream::at_step(&draw, Purpose::SensorNoise, 7);
+    let mut stream = PhiloxStream::at_step(&draw, DrawPurpose::SensorNoise, 7);
     let numbers: Vec<f64> = (0..1_000_000).map(|_| stream.normal()).collect();
     let (first, last, sum) = NUMPY;
     // Each number may differ by a relative 1e-13 from rounding. If NumPy rejected a draw that
@@ -115,7 +115,7 @@ fn held_actions_act_again() {
     assert_eq!(acted[0], action(0), "there is no action to hold yet");
     let is_held: Vec<bool> = (1..DRAWS).map(|t| acted[t as usize] == acted[t as usize - 1]).collect();
     for (t, &is_held) in (1..DRAWS).zip(&is_held) {
-        assert_eq!(is_held, stream(Purpose::ActionHold, t).unit() < PROBABILITY, "step {t}");
+        assert_eq!(is_held, stream(DrawPurpose::ActionHold, t).unit() < PROBABILITY, "step {t}");
         assert!(is_held || acted[t as usize] == action(t), "step {t}");
     }
     assert_frequency(is_held.iter().filter(|is_held| **is_held).count(), is_held.len(), PROBABILITY);
@@ -125,7 +125,7 @@ fn held_actions_act_again() {
 fn noise_on_actions_is_normal_and_a_share_of_the_range() {
     let acted = acted(&mut echo(&[("action_noise", 0.1)]), DRAWS, |_| [0.25, 1.0]);
     for (t, acted) in (0..DRAWS).zip(&acted) {
-        let [left, right] = normals(Purpose::ActionNoise, t);
+        let [left, right] = normals(DrawPurpose::ActionNoise, t);
         assert_eq!(*acted, [(0.25 + 0.1 * 2.0 * left) as f32, (1.0 + 0.1 * 2.0 * right) as f32], "step {t}");
     }
     assert_normal(acted.iter().map(|acted| acted[0].into()).collect(), 0.25, 0.2);
@@ -147,10 +147,10 @@ fn actions_pass_delay_hold_noise_and_scale_in_order() {
     let acted = acted(&mut echo(&values), 200, action);
     let mut held = NEUTRAL;
     for (t, acted) in (0..200).zip(acted) {
-        if t == 0 || stream(Purpose::ActionHold, t).unit() >= 0.5 {
+        if t == 0 || stream(DrawPurpose::ActionHold, t).unit() >= 0.5 {
             held = if t < 2 { NEUTRAL } else { action(t - 2) };
         }
-        let normals: [f64; 2] = normals(Purpose::ActionNoise, t);
+        let normals: [f64; 2] = normals(DrawPurpose::ActionNoise, t);
         let expected: [f32; 2] = std::array::from_fn(|i| {
             let noisy = (f64::from(held[i]) + 0.1 * 2.0 * normals[i]) as f32;
             let neutral = f64::from(NEUTRAL[i]);
@@ -186,7 +186,7 @@ fn noise_on_observations_is_normal_and_a_share_of_the_scale() {
     let exact = |t: u32| if t == 0 { [0.0, 0.0] } else { action(t - 1).map(f64::from) };
     let mut noise = [Vec::new(), Vec::new()];
     for (t, seen) in (0..=DRAWS).zip(&seen) {
-        let [left, right, steps] = normals(Purpose::SensorNoise, t);
+        let [left, right, steps] = normals(DrawPurpose::SensorNoise, t);
         let expected = [exact(t)[0] + 0.1 * left, exact(t)[1] + 0.1 * 3.0 * right, f64::from(t) + 0.1 * steps];
         assert_eq!(seen[..3], expected.map(|x| x as f32), "step {t}");
         assert_eq!(seen[3], echo::CONSTANT, "step {t}");
@@ -205,7 +205,7 @@ fn lost_observations_read_zero() {
     let mut lost = [0; 3];
     // Before the first step, the observed actions are 0.
     for (t, seen) in (1..=DRAWS).zip(&seen[1..]) {
-        let mut stream = stream(Purpose::SensorDropout, t);
+        let mut stream = stream(DrawPurpose::SensorDropout, t);
         for (entry, lost) in seen.iter().zip(&mut lost) {
             assert_eq!(*entry == 0.0, stream.unit() < PROBABILITY, "step {t}");
             *lost += usize::from(*entry == 0.0);
@@ -219,8 +219,8 @@ fn lost_observations_read_zero() {
 fn observations_pass_delay_noise_and_dropout_in_order() {
     let values = [("sensor_delay", 2.0), ("sensor_noise", 0.1), ("sensor_dropout", 0.3)];
     for (t, seen) in (0..=300).zip(seen(&mut echo(&values), 300)) {
-        let [_, _, steps] = normals(Purpose::SensorNoise, t);
-        let mut dropout = stream(Purpose::SensorDropout, t);
+        let [_, _, steps] = normals(DrawPurpose::SensorNoise, t);
+        let mut dropout = stream(DrawPurpose::SensorDropout, t);
         let (_, _, is_lost) = (dropout.unit(), dropout.unit(), dropout.unit() < 0.3);
         let expected = if is_lost { 0.0 } else { f64::from(t.saturating_sub(2)) + 0.1 * steps };
         assert_eq!(seen[2], expected as f32, "step {t}");
@@ -257,7 +257,7 @@ fn pushes_come_at_random_in_random_directions() {
     let pushed = pushed(&mut echo(&[("push", SIZE), ("push_interval", INTERVAL)]), DRAWS);
     let mut angles = Vec::new();
     for (t, push) in (0..DRAWS).zip(&pushed) {
-        let mut stream = stream(Purpose::Push, t);
+        let mut stream = stream(DrawPurpose::Push, t);
         if stream.unit() < 1.0 / INTERVAL {
             let turn = stream.unit();
             let (sin, cos) = libm::sincos(std::f64::consts::TAU * turn);
@@ -284,7 +284,7 @@ fn pushes_of_no_size_are_none_and_the_shortest_interval_is_one() {
 #[test]
 fn directions_are_uniform_on_a_line_a_circle_and_a_sphere() {
     let directions = |n| {
-        let direction = move |t| stream(Purpose::Push, t).direction(n);
+        let direction = move |t| stream(DrawPurpose::Push, t).direction(n);
         (0..DRAWS).map(direction).inspect(|[x, y, z]| assert!((x * x + y * y + z * z - 1.0).abs() < 1e-12))
     };
     let right = directions(1).filter(|direction| *direction == [1.0, 0.0, 0.0]).count();

@@ -8,7 +8,9 @@ mod laws;
 mod pushes;
 mod sessions;
 
-use perturb::env::{Distribution, EnvironmentSpec, Episodes, Parameter, Settings, Version, disturbance, resolve};
+use perturb::env::{
+    Distribution, EnvironmentSpec, EpisodeSettings, Episodes, ParameterSpec, Version, disturbance, resolve,
+};
 
 /// Returns settings of a disturbed environment: a version, and these values of parameters.
 fn settings(
@@ -16,11 +18,11 @@ fn settings(
     version: Version,
     values: &[(&str, f64)],
     (seed, environment_index): (u64, u32),
-) -> Settings {
+) -> EpisodeSettings {
     let spec = disturbance::disturbed(spec);
     let mut distributions = spec.distributions(version);
     resolve(spec, &mut distributions, values.iter().map(|&(name, value)| (name, Distribution::fixed(value)))).unwrap();
-    Settings { seed, environment_index, distributions, episodes_per_trial: 1 }
+    EpisodeSettings { seed, environment_index, distributions, episodes_per_trial: 1 }
 }
 
 /// Returns a disturbed environment, with a version and these values of parameters, at the start of its first episode.
@@ -35,7 +37,7 @@ fn disturbed(
 
 /// Returns a value with an effect for each disturbance that the environment supports.
 fn all(spec: &'static EnvironmentSpec) -> Vec<(&'static str, f64)> {
-    let value = |parameter: &Parameter| match parameter.name {
+    let value = |parameter: &ParameterSpec| match parameter.name {
         "action_delay" => 3.0,
         "sensor_delay" => 2.0,
         "action_scale" => 0.8,

@@ -5,7 +5,7 @@ use crate::{
     folder::{CART, TASK, folder, load},
 };
 use perturb::{
-    env::{Action, ActionSpace, Environment, EnvironmentSpec},
+    env::{Action, ActionSpec, Environment, EnvironmentSpec},
     tasks::{hopper, locomotion::Walker},
 };
 use perturb_mujoco::Simulation;
@@ -22,8 +22,8 @@ fn step(environment: &mut dyn Environment, impulse: Option<f64>) -> Vec<f64> {
     }
     let mut terms = vec![0.0; spec.reward_terms.len()];
     match spec.action {
-        ActionSpace::Discrete(_) => environment.step(Action::Discrete(1), &mut terms),
-        ActionSpace::Continuous(channels) => {
+        ActionSpec::Discrete(_) => environment.step(Action::Discrete(1), &mut terms),
+        ActionSpec::Continuous(channels) => {
             environment.step(Action::Continuous(&vec![0.0; channels.len()]), &mut terms)
         }
     };

@@ -1,7 +1,7 @@
 //! Each field of `edit` changes the compiled model in the same way as compiling an edited text.
 
 use super::{folder, load};
-use perturb::env::{Action, Environment, Purpose, Stream};
+use perturb::env::{Action, DrawPurpose, Environment, PhiloxStream};
 use rstest::rstest;
 
 const STEPS: usize = 100;
@@ -93,7 +93,7 @@ fn trajectory(environment: &mut dyn Environment) -> Vec<Vec<f64>> {
         };
     }
     environment.reset_to(&state);
-    let mut stream = Stream::new(4, 0, Purpose::InitialState, 0);
+    let mut stream = PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0);
     let mut states = Vec::new();
     for _ in 0..STEPS {
         let action: Vec<f32> = [1.0, 1.0, 3.0].map(|limit| stream.uniform(-limit, limit) as f32).into();

@@ -252,9 +252,14 @@ fn edits_of_gymnasiums_models_are_recompiled_texts() {
                 if !spec.parameters.is_empty() {
                     environment.set_parameters(&[value]);
                 }
-                environment.reset(&mut perturb::env::Stream::new(3, 0, perturb::env::Purpose::InitialState, 0));
-                let mut stream = perturb::env::Stream::new(3, 1, perturb::env::Purpose::InitialState, 0);
-                let perturb::env::ActionSpace::Continuous(channels) = spec.action else { panic!() };
+                environment.reset(&mut perturb::env::PhiloxStream::new(
+                    3,
+                    0,
+                    perturb::env::DrawPurpose::InitialState,
+                    0,
+                ));
+                let mut stream = perturb::env::PhiloxStream::new(3, 1, perturb::env::DrawPurpose::InitialState, 0);
+                let perturb::env::ActionSpec::Continuous(channels) = spec.action else { panic!() };
                 let mut saved = Vec::new();
                 for _ in 0..50 {
                     let action: Vec<f32> = channels.iter().map(|c| stream.uniform(c.low, c.high) as f32).collect();

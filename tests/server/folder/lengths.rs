@@ -3,7 +3,7 @@
 
 use super::{CART, TASK, folder, gymnasium, load};
 use crate::common::UPPER_LENGTH;
-use perturb::env::{Action, Environment, EnvironmentSpec, Purpose, Stream};
+use perturb::env::{Action, DrawPurpose, Environment, EnvironmentSpec, PhiloxStream};
 use perturb_mujoco::{Model, Simulation};
 use std::{fs, path::Path};
 
@@ -35,7 +35,7 @@ fn assert_is(environment: &mut dyn Environment, mjcf: &str, about: &str) {
         environment.save(&mut saved);
         saved[1..=n].to_vec()
     };
-    let mut stream = Stream::new(4, 0, Purpose::InitialState, 0);
+    let mut stream = PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0);
     environment.reset(&mut stream);
     bare.set_state(&physics(environment)).unwrap();
     let n_actions = bare.model().n_u();
@@ -222,7 +222,7 @@ fn applied(environment: &dyn Environment) -> Vec<f64> {
 }
 
 fn trajectory(environment: &mut dyn Environment) -> Vec<u64> {
-    let mut stream = Stream::new(4, 0, Purpose::InitialState, 0);
+    let mut stream = PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0);
     environment.reset(&mut stream);
     let mut states = Vec::new();
     for step in 0..20_i16 {
@@ -273,13 +273,13 @@ fn an_impossible_model_is_divergence_and_told_by_the_receipt() {
         environment.set_parameters(&[1.0, before, 0.04, 0.0]);
         // Each value alone is possible. Together they give the pole less than MuJoCo's minimum inertia.
         environment.set_parameters(&[1.5, 0.000_1, 0.000_1, 0.0]);
-        environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
+        environment.reset(&mut PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0));
         assert!(environment.scene().is_none());
         assert!(environment.step(Action::Continuous(&[0.0]), &mut [0.0; 2]).diverged);
         assert_eq!(applied(environment.as_ref()), defaults, "after a pole of {before} m");
     }
     environment.set_parameters(&[1.0, 0.8, 0.04, 0.0]);
-    environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
+    environment.reset(&mut PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0));
     assert!(!environment.step(Action::Continuous(&[0.0]), &mut [0.0; 2]).diverged);
 }
 
@@ -294,7 +294,7 @@ fn a_free_body_is_reset_where_its_model_has_it() {
     let mut environment = with_parameters(TASK, ("cart.xml", &model), "FreeCart", &[lift]);
     let mut height = |lift: f64| {
         environment.set_parameters(&[0.5, lift]);
-        environment.reset(&mut Stream::new(4, 0, Purpose::InitialState, 0));
+        environment.reset(&mut PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0));
         let mut observation = vec![0.0; environment.spec().observation.len()];
         environment.observe(&mut observation);
         observation[2]

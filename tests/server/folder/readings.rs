@@ -1,7 +1,7 @@
 //! Readings, rewards and success rules agree with the simulation.
 
 use super::{CART, TASK, folder, load};
-use perturb::env::{Action, Environment, EnvironmentSpec, Episodes, Settings, Version};
+use perturb::env::{Action, Environment, EnvironmentSpec, EpisodeSettings, Episodes, Version};
 
 /// Loads the cart task with some lines replaced, e.g. another observation, reward or success rule.
 fn with(name: &str, replaced: &[(&str, &str)]) -> &'static EnvironmentSpec {
@@ -179,7 +179,7 @@ fn huge_actions_make_finite_rewards() {
 fn achieved(name: &str, success: &str) -> (Option<f64>, bool) {
     let spec = with(name, &[("success", success), ("step_limit", "step_limit = 5")]);
     let distributions = spec.distributions(Version::D);
-    let settings = Settings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
+    let settings = EpisodeSettings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
     let mut episodes = Episodes::new((spec.make)().unwrap(), settings);
     episodes.begin(Some(&[0.0, 0.0, 1.0, 0.0]));
     while !episodes.ended() {

@@ -130,7 +130,8 @@ async fn nothing_is_drawn_that_cannot_be_written_down() {
         server.arg("--ledger").arg(path).args(["--listen", "tcp://127.0.0.1:0"]);
         disk::with_file_limit(&server, blocks)
     };
-    for (mut command, part) in [(limited(0, &path), "File too large"), (limited(9, Path::new("/dev/full")), "regular file")]
+    for (mut command, part) in
+        [(limited(0, &path), "File too large"), (limited(9, Path::new("/dev/full")), "regular file")]
     {
         let server = command.output().unwrap();
         let words = String::from_utf8(server.stderr).unwrap();

@@ -2,8 +2,8 @@
 
 use perturb::{
     env::{
-        Achievement, Action, ActionSpace, Channel, Comparison, Environment, EnvironmentSpec, Error, Parameter,
-        Quantity, RewardTerm, Stream, Success, Transition,
+        Achievement, Action, ActionSpec, ChannelSpec, Environment, EnvironmentSpec, Error, ParameterSpec, PhiloxStream,
+        QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec, Transition,
     },
     scene::{Drawing, Scene, colour},
 };
@@ -15,21 +15,21 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     description: "Push a ball along a line.",
     make: &|| Ok(Box::new(Ball { mass: 1.0, drag: 0.5, state: [0.0; 2], distance: 0.0 })),
     parameters: &[
-        Parameter::new("mass", "kg", "the ball's mass", (0.1, 10.0)).versions(1.0, (0.5, 2.0), (0.2, 4.0)),
-        Parameter::new("drag", "N s/m", "force for each m/s", (0.0, 5.0)).versions(0.5, (0.2, 0.8), (0.1, 1.0)),
+        ParameterSpec::new("mass", "kg", "the ball's mass", (0.1, 10.0)).versions(1.0, (0.5, 2.0), (0.2, 4.0)),
+        ParameterSpec::new("drag", "N s/m", "force for each m/s", (0.0, 5.0)).versions(0.5, (0.2, 0.8), (0.1, 1.0)),
     ],
     observation: STATE,
-    action: ActionSpace::Continuous(&[Channel::new("force", "N", -1.0, 1.0)]),
+    action: ActionSpec::Continuous(&[ChannelSpec::new("force", "N", -1.0, 1.0)]),
     state: STATE,
-    reward_terms: &[RewardTerm { name: "progress", description: "the step's way, m" }],
-    applied: &[Quantity { name: "mass", unit: "kg" }, Quantity { name: "drag", unit: "N s/m" }],
+    reward_terms: &[RewardTermSpec { name: "progress", description: "the step's way, m" }],
+    applied: &[QuantitySpec { name: "mass", unit: "kg" }, QuantitySpec { name: "drag", unit: "N s/m" }],
     step_limit: 20,
     control_timestep: DT,
     step_cost: 0.1,
-    success: Success {
+    success: SuccessRuleSpec {
         description: "the ball came 0.3 m far",
-        achievement: Achievement::Own(Quantity { name: "distance", unit: "m" }),
-        comparison: Comparison::AtLeast,
+        achievement: Achievement::Own(QuantitySpec { name: "distance", unit: "m" }),
+        comparison: SuccessComparison::AtLeast,
         threshold: 0.3,
     },
     push: None,
@@ -37,7 +37,8 @@ pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     heatmap_axes: Some(["mass", "drag"]),
 };
 
-const STATE: &[Channel] = &[Channel::new("x", "m", -100.0, 100.0), Channel::new("velocity", "m/s", -100.0, 100.0)];
+const STATE: &[ChannelSpec] =
+    &[ChannelSpec::new("x", "m", -100.0, 100.0), ChannelSpec::new("velocity", "m/s", -100.0, 100.0)];
 const DT: f64 = 0.1;
 /// An action with which the step of a ball panics.
 pub const FATAL: f32 = 1e9;
@@ -67,7 +68,7 @@ impl Environment for Ball {
         Some(self.distance)
     }
 
-    fn reset(&mut self, stream: &mut Stream) {
+    fn reset(&mut self, stream: &mut PhiloxStream) {
         self.reset_to(&[stream.uniform(-0.1, 0.1), 0.0]);
     }
 

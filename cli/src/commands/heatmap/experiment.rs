@@ -4,7 +4,7 @@ use std::io::Write;
 use std::path::Path;
 
 use perturb_experiment::{
-    Folder, HeatmapPlace, NoHeatmap, Results, Selected, heatmap_path, heatmap_places, store_heatmap,
+    ExperimentFolder, HeatmapPlace, NoHeatmap, Results, Selected, heatmap_path, heatmap_places, store_heatmap,
 };
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::checkpoint::Checkpoint;
@@ -33,7 +33,7 @@ struct HeatmapCounts {
 
 /// Tests the selected policies that have no heatmap yet, and draws the heatmaps of all selected policies.
 pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
-    let mut folder = Folder::new(directory);
+    let mut folder = ExperimentFolder::new(directory);
     let plan = plan_in(&folder)?;
     let report = match &args.out {
         Some(out) => {
@@ -115,7 +115,7 @@ fn missing_parameter(args: &HeatmapArgs, environment: &proto::Environment) -> Op
 /// Makes the heatmap of a selected policy unless it exists already. Returns whether it exists afterwards.
 fn make(
     args: &HeatmapArgs,
-    folder: &Folder,
+    folder: &ExperimentFolder,
     place: &HeatmapPlace<'_>,
     kind: &HeatmapKind,
     servers: &Servers,
@@ -146,7 +146,7 @@ fn make(
 }
 
 /// Loads the checkpoint of a cell, and checks that it belongs to the cell's result.
-fn checkpoint_of(folder: &Folder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
+fn checkpoint_of(folder: &ExperimentFolder, Selected { cell, result }: Selected<'_>) -> Result<Checkpoint> {
     let checkpoint = Checkpoint::load(&folder.cell(&cell.id).training())?;
     let state = &checkpoint.state;
     let training = &result.training;

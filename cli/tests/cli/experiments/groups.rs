@@ -1,7 +1,7 @@
 //! Events of cells that run together in a group.
 
 use perturb_experiment::scheduler::CellEvent;
-use perturb_experiment::{Failure, FailureId, Folder};
+use perturb_experiment::{ExperimentFolder, FailureId, FailureRecord};
 use perturb_files::interrupt::StopFlag;
 use perturb_learner::cell::{CellJob, run_cells};
 use perturb_learner::client::Servers;
@@ -17,7 +17,7 @@ fn ends(
     cells: &[(usize, Option<FailureId>)],
     stop: &StopFlag,
 ) -> Vec<(usize, CellEvent)> {
-    let folder = Folder::new(&experiment.out("out"));
+    let folder = ExperimentFolder::new(&experiment.out("out"));
     let order = |&(cell, retry): &(usize, Option<FailureId>)| {
         let cell = &experiment.plan.cells[cell];
         CellJob { cell, folder: folder.cell(&cell.id), retry }
@@ -40,11 +40,11 @@ fn each_cell_of_a_group_ends_once() {
     let local = server(1);
     let stop = StopFlag::default();
     let servers = Servers::connect(std::slice::from_ref(local.address())).unwrap_or_else(|error| panic!("{error}"));
-    let place = |cell: usize| Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
+    let place = |cell: usize| ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
     assert_eq!(ends(&experiment, &servers, &[(0, None)], &stop), [(0, CellEvent::Done)]);
 
     let lock = place(1).try_lock().expect("a file").expect("a lock");
-    let failure = Failure {
+    let failure = FailureRecord {
         id: experiment.plan.cells[2].id.clone(),
         reason: "NaN".into(),
         commit: "x".into(),

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use perturb_experiment::Folder;
+use perturb_experiment::ExperimentFolder;
 use perturb_learner::checkpoint::Checkpoint;
 
 use super::{Experiment, kill_all, succeeded};
@@ -34,7 +34,7 @@ settings = { episodes_per_iteration = 20 }
 impl Experiment {
     /// Returns the bytes of all results, records and stored policies.
     fn kept(&self, name: &str) -> BTreeMap<PathBuf, Vec<u8>> {
-        let folder = Folder::new(&self.out(name));
+        let folder = ExperimentFolder::new(&self.out(name));
         let mut files = BTreeMap::new();
         for cell in &self.plan.cells {
             let place = folder.cell(&cell.id).path().to_owned();
@@ -70,7 +70,7 @@ fn intermediate_evaluations_survive_kills() {
         let plain = without.cell_result("out", index);
         assert_eq!((&marked.training.counters, &marked.results), (&plain.training.counters, &plain.results));
         let training = |experiment: &Experiment, name: &str| {
-            let folder = Folder::new(&experiment.out(name));
+            let folder = ExperimentFolder::new(&experiment.out(name));
             let path = folder.cell(&experiment.plan.cells[index].id).training();
             (std::fs::read(path.join("monitor.csv")).is_ok(), Checkpoint::load(&path).expect("a checkpoint"))
         };
@@ -83,8 +83,10 @@ fn intermediate_evaluations_survive_kills() {
         let policies: Vec<String> = [10, 30]
             .iter()
             .map(|mark| {
-                let place =
-                    Folder::new(&experiment.out("whole")).cell(&marked.id).training().join(format!("marks/{mark}"));
+                let place = ExperimentFolder::new(&experiment.out("whole"))
+                    .cell(&marked.id)
+                    .training()
+                    .join(format!("marks/{mark}"));
                 Checkpoint::load(&place).expect("a policy").id().expect("a name")
             })
             .collect();
@@ -116,7 +118,7 @@ fn an_intermediate_policy_is_that_of_a_shorter_training() {
     });
     for index in [0, 2] {
         let policy = |experiment: &Experiment, place: &str| {
-            let cell = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[index].id);
+            let cell = ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[index].id);
             let Checkpoint { state, weights, .. } = Checkpoint::load(&cell.training().join(place)).expect("a policy");
             (state.counters, state.observation_normaliser, state.reward_normaliser, weights)
         };
@@ -135,7 +137,7 @@ fn a_training_without_its_intermediate_policies_restarts() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));
     let whole = experiment.kept("out");
-    let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
+    let place = ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
     std::fs::remove_dir_all(place.training().join("marks/10")).expect("deleted");
     std::fs::remove_file(place.path().join("result.json")).expect("deleted");
     succeeded(&experiment.run("out", &["--cell", "0"]));

@@ -16,7 +16,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Output};
 
-use perturb_experiment::{Cell, CellResult, CellState, Folder, Plan};
+use perturb_experiment::{Cell, CellResult, CellState, ExperimentFolder, Plan};
 
 use crate::common::{is_running, kill, perturb, stderr, wait_for};
 use tempfile::TempDir;
@@ -81,21 +81,22 @@ impl Experiment {
 
     /// Returns the bytes of all results.
     fn results(&self, name: &str) -> BTreeMap<String, Vec<u8>> {
-        let folder = Folder::new(&self.out(name));
+        let folder = ExperimentFolder::new(&self.out(name));
         let read = |id: &str| std::fs::read(folder.cell(id).path().join("result.json")).ok();
         self.plan.cells.iter().filter_map(|cell| Some((cell.id.clone(), read(&cell.id)?))).collect()
     }
 
     fn cell_result(&self, name: &str, index: usize) -> Box<CellResult> {
-        match Folder::new(&self.out(name)).state(&self.plan.cells[index]) {
+        match ExperimentFolder::new(&self.out(name)).state(&self.plan.cells[index]) {
             Ok(CellState::Done(result)) => result,
             other => panic!("cell {index} is {other:?}"),
         }
     }
 
-    /// Returns how often each cell's training was begun or resumed. The log of a group is in the folder of its first cell.
+    /// Returns how often each cell's training was begun or resumed. The log of a group is in the folder of its first
+    /// cell.
     fn attempts(&self, name: &str) -> Vec<usize> {
-        let folder = Folder::new(&self.out(name));
+        let folder = ExperimentFolder::new(&self.out(name));
         let log = |cell: &Cell| std::fs::read_to_string(folder.cell(&cell.id).log()).unwrap_or_default();
         let logs: String = self.plan.cells.iter().map(log).collect();
         // The warning about a missing checkpoint also contains the folder's name, and does not count.

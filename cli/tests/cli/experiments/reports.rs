@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 use std::process::Output;
 
-use perturb_experiment::{CellState, Folder};
+use perturb_experiment::{CellState, ExperimentFolder};
 use perturb_records::Records;
 
 use super::{Experiment, PLAN, kill_all, succeeded};
@@ -91,7 +91,7 @@ fn draw_again(training: &Path, directory: &Path, records: &str) -> Output {
 fn a_heatmap_needs_two_known_parameters() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &["--cell", "0"]));
-    let training = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
+    let training = ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
     let elsewhere = tempfile::tempdir().expect("a directory");
     let draw = |arguments: &[&str]| {
         let mut command = perturb(&["heatmap", "--grid", "3", "--episodes", "2", "--checkpoint"]);
@@ -163,7 +163,7 @@ fn a_heatmap_of_several_policies_is_their_mean() {
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']",
     );
     succeeded(&experiment.run("out", &["--jobs", "2"]));
-    let folder = Folder::new(&experiment.out("out"));
+    let folder = ExperimentFolder::new(&experiment.out("out"));
     let trainings: Vec<PathBuf> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).training()).collect();
     let elsewhere = tempfile::tempdir().expect("a directory");
     let draw = |trainings: &[&PathBuf], arguments: &[&str]| {
@@ -291,7 +291,7 @@ fn heatmaps_of_an_experiment_are_made_once() {
     assert_eq!(heatmap_files(&out), first, "the same bytes again");
     let name = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
     let id = experiment.plan.cells.iter().map(|cell| &cell.id).find(|id| name.starts_with(*id)).expect("a cell");
-    let place = Folder::new(&out).cell(id);
+    let place = ExperimentFolder::new(&out).cell(id);
     let Ok(CellState::Done(mut result)) = place.state() else { panic!("{id} has no result") };
     result.command = format!("/bin/{}", result.command);
     place.write_result(&result).expect("written");
@@ -303,7 +303,7 @@ fn heatmaps_of_an_experiment_are_made_once() {
 
 /// A result without its checkpoint has no heatmap. The other heatmaps are made.
 fn without_its_checkpoint(experiment: &Experiment, id: &str) {
-    std::fs::remove_dir_all(Folder::new(&experiment.out("out")).cell(id).training()).expect("deleted");
+    std::fs::remove_dir_all(ExperimentFolder::new(&experiment.out("out")).cell(id).training()).expect("deleted");
     let output = experiment.heatmap("out", &[]);
     assert_eq!(output.status.code(), Some(1));
     let said = stderr(&output);

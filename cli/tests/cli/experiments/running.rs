@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command};
 
-use perturb_experiment::{CellResult, CellState, Counts, Folder, Plan};
+use perturb_experiment::{CellResult, CellState, Counts, ExperimentFolder, Plan};
 use perturb_learner::client::PrivateServer;
 
 use super::{Experiment, PLAN, children, kill_all, succeeded};
@@ -27,7 +27,7 @@ fn results_do_not_depend_on_jobs_groups_or_kills() {
     }
     succeeded(&experiment.run("killed", &["--jobs", "1"]));
     assert_eq!(experiment.results("killed"), whole);
-    let folder = Folder::new(&experiment.out("killed"));
+    let folder = ExperimentFolder::new(&experiment.out("killed"));
     let unfinished = |id: &str| {
         let entries = std::fs::read_dir(folder.cell(id).path()).expect("a folder");
         entries
@@ -53,7 +53,7 @@ fn a_group_finishes_although_its_process_is_killed() {
     let told = std::fs::read_to_string(told).expect("lines");
     let killed = told.matches(r#""event":"killed","reason":"its process ended with signal: 9 (SIGKILL)"#).count();
     assert!((1..=3).contains(&killed), "{told}");
-    let place = |cell: usize| Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
+    let place = |cell: usize| ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
     let first = &experiment.plan.cells[0].id;
     let log = std::fs::read_to_string(place(2).log()).expect("a log");
     assert!(log.starts_with(&format!("done together with {first}: see ../{first}/log.txt\n")), "{log}");
@@ -112,7 +112,7 @@ fn a_failed_cell_has_a_reason_and_the_others_run() {
         experiment.plan.cells.iter().find(|cell| cell.config.table()["learning_rate"].as_float() == Some(1e38));
     let failed = failed.expect("a cell");
     let out = experiment.out("out").display().to_string();
-    let Ok(CellState::Failed(failure)) = Folder::new(&experiment.out("out")).state(failed) else { panic!() };
+    let Ok(CellState::Failed(failure)) = ExperimentFolder::new(&experiment.out("out")).state(failed) else { panic!() };
     assert!(
         failure.reason.contains("lower the learning rate") && !failure.reason.contains(&*out),
         "{}",
@@ -133,7 +133,7 @@ fn two_simultaneous_retries_run_each_cell_once() {
     let cells = experiment.plan.cells.len();
     assert_eq!(experiment.run("out", &["--jobs", "2"]).status.code(), Some(1));
     assert_eq!(experiment.attempts("out"), vec![1; cells]);
-    let folder = Folder::new(&experiment.out("out"));
+    let folder = ExperimentFolder::new(&experiment.out("out"));
     let held: Vec<_> = experiment.plan.cells.iter().map(|cell| folder.cell(&cell.id).try_lock()).collect();
     let told = [0, 1].map(|run| experiment.out(&format!("{run}.jsonl")));
     let run = |told: &PathBuf| {
@@ -156,8 +156,9 @@ fn two_simultaneous_retries_run_each_cell_once() {
 fn a_result_names_the_program_that_began_the_training() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 200"));
     let id = &experiment.plan.cells[0].id;
-    let document =
-        |name: &str| Folder::new(&experiment.out(name)).cell(id).training().join("checkpoint/checkpoint.json");
+    let document = |name: &str| {
+        ExperimentFolder::new(&experiment.out(name)).cell(id).training().join("checkpoint/checkpoint.json")
+    };
     let child = experiment.command("same", &["--cell", "0"]).spawn().expect("started");
     wait_for("a checkpoint", || document("same").exists());
     kill_all(child);
@@ -216,7 +217,7 @@ fn a_lost_server_is_no_cells_failure() {
     let output = ended(child);
     assert_eq!(output.status.code(), Some(1));
     assert!(stderr(&output).contains("cannot go on without a server"), "{}", stderr(&output));
-    let folder = Folder::new(&experiment.out("out"));
+    let folder = ExperimentFolder::new(&experiment.out("out"));
     assert!(experiment.plan.cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
 
     let one = experiment.run("out", &["--cell", "0", "--server", &address]);
@@ -253,7 +254,7 @@ fn a_run_restarts_its_private_server_with_same_results() {
 #[test]
 fn locked_cells_are_skipped_until_the_lock_is_free() {
     let experiment = Experiment::new(PLAN);
-    let place = Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
+    let place = ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id);
     let lock = place.try_lock().expect("a file").expect("a lock");
     let told = experiment.out("told.jsonl");
     let mut command = experiment.command("out", &["--cell", "0", "--json"]);

@@ -2,7 +2,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use perturb_experiment::{Cell, CellState, Folder, SELECTION_TEST, Selection};
+use perturb_experiment::{Cell, CellState, ExperimentFolder, SELECTION_TEST, Selection};
 use perturb_records::{FILE, Records};
 
 use super::{Experiment, kill_all, succeeded};
@@ -28,12 +28,12 @@ grid = { learning_rate = [7e-3, 7e-4] }
 impl Experiment {
     /// Returns all cells of the plan, including the cells that the folder's results select.
     fn cells(&self, name: &str) -> Vec<Cell> {
-        self.plan.with_selected_cells(&Folder::new(&self.out(name))).expect("readable").cells
+        self.plan.with_selected_cells(&ExperimentFolder::new(&self.out(name))).expect("readable").cells
     }
 
     /// Returns the bytes of all results of these cells.
     fn all_results(&self, name: &str) -> BTreeMap<String, [Vec<u8>; 2]> {
-        let folder = Folder::new(&self.out(name));
+        let folder = ExperimentFolder::new(&self.out(name));
         let read = |id: &str, file: &str| std::fs::read(folder.cell(id).path().join(file)).ok();
         let of = |cell: Cell| Some((cell.id.clone(), [read(&cell.id, "result.json")?, read(&cell.id, FILE)?]));
         self.cells(name).into_iter().filter_map(of).collect()
@@ -73,7 +73,7 @@ fn selected_cells_run_after_any_number_of_kills() {
 fn reported_tests_share_nothing_with_selection_tests() {
     let experiment = Experiment::new(PLAN);
     succeeded(&experiment.run("out", &[]));
-    let folder = Folder::new(&experiment.out("out"));
+    let folder = ExperimentFolder::new(&experiment.out("out"));
     let mut selecting = BTreeSet::new();
     let mut reported = BTreeSet::new();
     for cell in experiment.cells("out") {

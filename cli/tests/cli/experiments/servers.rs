@@ -2,7 +2,7 @@
 
 use std::fs::File;
 
-use perturb_experiment::Folder;
+use perturb_experiment::ExperimentFolder;
 
 use super::{Experiment, kill_all, succeeded};
 use crate::common::{ended, wait_for};
@@ -34,8 +34,9 @@ fn a_run_gives_same_results_after_its_server_restarts() {
     let mut command = experiment.command("out", &arguments);
     let child = command.stderr(File::create(&said).expect("a file")).spawn().expect("started");
     let losses = || std::fs::read_to_string(&said).expect("words").matches("; waiting for it, at most").count();
-    let training =
-        |name: &str, cell: usize| Folder::new(&experiment.out(name)).cell(&experiment.plan.cells[cell].id).training();
+    let training = |name: &str, cell: usize| {
+        ExperimentFolder::new(&experiment.out(name)).cell(&experiment.plan.cells[cell].id).training()
+    };
     for cell in 0..2 {
         wait_for("a checkpoint", || training("out", cell).join("checkpoint/checkpoint.json").exists());
         let before = losses();

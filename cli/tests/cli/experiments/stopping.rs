@@ -1,6 +1,6 @@
 //! Trainings that stop at a success rate.
 
-use perturb_experiment::Folder;
+use perturb_experiment::ExperimentFolder;
 use perturb_learner::checkpoint::Checkpoint;
 
 use super::{Experiment, succeeded};
@@ -39,8 +39,9 @@ fn an_early_stop_equals_a_training_of_that_budget() {
     succeeded(&plain.run("out", &[]));
     let with_that_budget = plain.cell_result("out", 0);
     assert_eq!((&stopped.results, &stopped.marks[&40]), (&with_that_budget.results, &with_that_budget.marks[&40]));
-    let training =
-        |experiment: &Experiment| Folder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training();
+    let training = |experiment: &Experiment| {
+        ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[0].id).training()
+    };
     let weights = |experiment: &Experiment| Checkpoint::load(&training(experiment)).expect("a checkpoint").weights;
     assert!(weights(&early) == weights(&plain), "and its policy");
 
@@ -49,7 +50,7 @@ fn an_early_stop_equals_a_training_of_that_budget() {
     let output = perturb(&["train", "--resume"]).arg(training(&early)).output().expect("ended");
     let said = stderr(&output);
     assert!(said.contains(&format!("it has {episodes} of 2000 episodes and stopped at ")), "{said}");
-    let result = Folder::new(&early.out("out")).cell(&early.plan.cells[0].id).path().join("result.json");
+    let result = ExperimentFolder::new(&early.out("out")).cell(&early.plan.cells[0].id).path().join("result.json");
     let before = std::fs::read(&result).expect("a result");
     std::fs::remove_file(&result).expect("removed");
     succeeded(&early.run("out", &[]));

@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Output};
 use std::time::{Duration, Instant};
 
-use perturb_experiment::{Cell, Folder, Plan};
+use perturb_experiment::{Cell, ExperimentFolder, Plan};
 use perturb_learner::client::PrivateServer;
 use tempfile::TempDir;
 
@@ -80,7 +80,7 @@ impl Experiment {
     }
 
     fn cell(&self, name: &str, id: &str) -> PathBuf {
-        Folder::new(&self.out(name)).cell(id).path().to_owned()
+        ExperimentFolder::new(&self.out(name)).cell(id).path().to_owned()
     }
 
     fn result(&self, id: &str) -> PathBuf {

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use perturb_settings::Method;
 
-use crate::folder::Folder;
+use crate::folder::ExperimentFolder;
 use crate::plan::{Cell, Plan};
 
 /// The process times of finished cells, by environment and method. They predict the durations of the remaining cells.
@@ -24,7 +24,7 @@ struct Sum {
 
 impl<'a> CellDurations<'a> {
     /// Reads the durations of the cells of `plan` that have a result in `folder`.
-    pub fn read(plan: &'a Plan, folder: &Folder) -> Self {
+    pub fn read(plan: &'a Plan, folder: &ExperimentFolder) -> Self {
         let mut durations = Self::default();
         for cell in &plan.cells {
             let place = folder.cell(&cell.id);
@@ -67,7 +67,7 @@ mod tests {
             [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
         let plan = Plan::parse("test", text.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         for (cell, seconds, done) in [(0, 10.0, true), (1, 20.0, true), (2, 900.0, false)] {
             let place = folder.cell(&plan.cells[cell].id);
             place.write_timing(&Timing { seconds }).unwrap();

@@ -9,7 +9,7 @@ use perturb_text::{grouped, shortened};
 
 use super::RunSummary;
 use crate::eta::CellDurations;
-use crate::folder::{CellResult, CellState, Folder, FolderError};
+use crate::folder::{CellResult, CellState, ExperimentFolder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
 
@@ -22,7 +22,7 @@ pub const LEADS_OUT: &str = "a link that leads out of the folder";
 #[derive(Clone, Debug)]
 pub struct ExperimentStatus {
     /// The folder of the experiment.
-    pub folder: Folder,
+    pub folder: ExperimentFolder,
     /// The plan, including the cells that its selection has added so far.
     pub plan: Plan,
     /// The status of each cell, in the plan's order.
@@ -78,7 +78,7 @@ impl ExperimentStatus {
 
     /// Reads the status of an experiment. `within` is the folder that links must not lead out of.
     fn with(path: &Path, within: Option<PathBuf>) -> Result<Self, AnyError> {
-        let folder = Folder::new(path);
+        let folder = ExperimentFolder::new(path);
         let stamp = Stamp::read(&folder.plan_path());
         let plan = read_plan(&folder, within.as_deref())?;
         let (records, cells) = plan.cells.iter().map(|cell| known(&folder, cell, within.as_deref())).unzip();
@@ -194,7 +194,7 @@ impl CellStatus {
 
 /// Reads the plan, with the cells that its selection has added so far. With `within`, refuses links that lead out of
 /// this folder, and plans with too many cells.
-fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
+fn read_plan(folder: &ExperimentFolder, within: Option<&Path>) -> Result<Plan, AnyError> {
     let path = folder.require_plan()?;
     if let Some(root) = within {
         let out = |name: &Path| leads_out(root, folder.path(), name);
@@ -224,26 +224,26 @@ fn read_plan(folder: &Folder, within: Option<&Path>) -> Result<Plan, AnyError> {
 }
 
 /// Returns an error if the result or failure of a cell is behind a link that leads out of `root`.
-fn require_within(folder: &Folder, cell: &Cell, root: &Path) -> Result<(), String> {
+fn require_within(folder: &ExperimentFolder, cell: &Cell, root: &Path) -> Result<(), String> {
     let place = Path::new("cells").join(&cell.id);
     let out = RECORDS.into_iter().find(|name| leads_out(root, folder.path(), place.join(name)));
     out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
 }
 
 /// Returns the current stamps of a cell's result and failure files.
-fn records(folder: &Folder, cell: &Cell) -> RecordStamps {
+fn records(folder: &ExperimentFolder, cell: &Cell) -> RecordStamps {
     let place = folder.cell(&cell.id);
     RECORDS.map(|name| Stamp::read(&place.path().join(name)))
 }
 
 /// Reads the stamps and the status of a cell.
-fn known(folder: &Folder, cell: &Cell, within: Option<&Path>) -> (RecordStamps, CellStatus) {
+fn known(folder: &ExperimentFolder, cell: &Cell, within: Option<&Path>) -> (RecordStamps, CellStatus) {
     let records = records(folder, cell);
     (records, status(folder, cell, records, within))
 }
 
 /// Reads the status of a cell. `records` are the current stamps of its files.
-fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&Path>) -> CellStatus {
+fn status(folder: &ExperimentFolder, cell: &Cell, records: RecordStamps, within: Option<&Path>) -> CellStatus {
     let place = folder.cell(&cell.id);
     if records == [None; 2] {
         let begun = place.path().is_dir();
@@ -271,7 +271,7 @@ fn status(folder: &Folder, cell: &Cell, records: RecordStamps, within: Option<&P
 mod tests {
     use super::*;
     use crate::fixture;
-    use crate::folder::Failure;
+    use crate::folder::FailureRecord;
 
     const PLAN: &str = "environments = ['Pendulum']\nversions = ['D']\nruns = 3
         [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
@@ -279,7 +279,7 @@ mod tests {
     #[test]
     fn cells_are_followed_from_their_beginning_to_their_result() {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         assert!(ExperimentStatus::read(directory.path()).is_err());
         folder.keep_plan(&plan).unwrap();
@@ -294,8 +294,12 @@ mod tests {
         status.refresh().unwrap();
         assert_eq!(status.cells[0], CellStatus::Waiting { begun: true });
         places[0].write_result(&fixture::result(&plan.cells[0], [90.0, 60.0, 30.0], 1.0)).unwrap();
-        let failure =
-            Failure { id: plan.cells[1].id.clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+        let failure = FailureRecord {
+            id: plan.cells[1].id.clone(),
+            reason: "NaN".into(),
+            commit: "x".into(),
+            requires_restart: true,
+        };
         places[1].write_failure(&failure).unwrap();
         std::fs::create_dir_all(places[2].path()).unwrap();
         std::fs::write(places[2].path().join("result.json"), "{").unwrap();
@@ -330,7 +334,7 @@ mod tests {
         let outside = directory.path().join("outside.json");
         std::fs::write(&outside, "{\"secret\": 7}").unwrap();
         let root = directory.path().canonicalize().unwrap().join("root");
-        let folder = Folder::new(&root.join("study"));
+        let folder = ExperimentFolder::new(&root.join("study"));
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         folder.keep_plan(&plan).unwrap();
         let cell = folder.cell(&plan.cells[0].id);
@@ -356,11 +360,11 @@ mod tests {
     #[test]
     fn long_reasons_and_large_plans_are_limited() {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         folder.keep_plan(&plan).unwrap();
         let (id, commit) = (plan.cells[0].id.clone(), "x".into());
-        let failure = Failure { id, reason: "long ".repeat(1000), commit, requires_restart: true };
+        let failure = FailureRecord { id, reason: "long ".repeat(1000), commit, requires_restart: true };
         folder.cell(&failure.id).write_failure(&failure).unwrap();
         let status = ExperimentStatus::read(directory.path()).unwrap();
         assert!(matches!(&status.cells[0], CellStatus::Failed(reason) if reason.len() < 400));

@@ -12,13 +12,13 @@ use perturb_protocol::spawn_failure;
 
 use super::event::{last_words, read_lines, write_line};
 use super::{Backend, BackendEvent, CellEvent, JobCell, PendingCell, Result, WorkerJob};
-use crate::folder::Folder;
+use crate::folder::ExperimentFolder;
 use crate::plan::{Grouping, Plan};
 
 /// A [`Backend`] that runs worker processes on this machine. Each worker locks its own cells.
 pub struct Local<'a> {
     plan: &'a Plan,
-    folder: &'a Folder,
+    folder: &'a ExperimentFolder,
     grouping: Grouping,
     command: &'a dyn Fn(usize) -> Command,
     server: &'a dyn Fn() -> Option<BackendEvent>,
@@ -50,7 +50,7 @@ impl<'a> Local<'a> {
     /// [`EventLine`](super::EventLine)s. The backend calls `server` at every poll for events of the servers.
     pub fn new(
         plan: &'a Plan,
-        folder: &'a Folder,
+        folder: &'a ExperimentFolder,
         grouping: Grouping,
         command: &'a dyn Fn(usize) -> Command,
         server: &'a dyn Fn() -> Option<BackendEvent>,
@@ -235,13 +235,18 @@ mod tests {
     }
 
     /// Runs the plan with a shell script in place of each worker. Each worker gets one cell.
-    fn run_script(folder: &Folder, script: &str, stop: &StopFlag, server: &dyn Fn() -> Option<BackendEvent>) -> Ran {
+    fn run_script(
+        folder: &ExperimentFolder,
+        script: &str,
+        stop: &StopFlag,
+        server: &dyn Fn() -> Option<BackendEvent>,
+    ) -> Ran {
         run_grouped(Grouping { max_cells: 1, at_a_time: 2 }, folder, script, stop, server)
     }
 
     fn run_grouped(
         grouping: Grouping,
-        folder: &Folder,
+        folder: &ExperimentFolder,
         script: &str,
         stop: &StopFlag,
         server: &dyn Fn() -> Option<BackendEvent>,
@@ -252,7 +257,7 @@ mod tests {
     fn run_plan(
         plan: &Plan,
         grouping: Grouping,
-        folder: &Folder,
+        folder: &ExperimentFolder,
         script: &str,
         stop: &StopFlag,
         server: &dyn Fn() -> Option<BackendEvent>,
@@ -273,9 +278,9 @@ mod tests {
         Ran { end, lines }
     }
 
-    fn place() -> (tempfile::TempDir, Folder, [String; 2]) {
+    fn place() -> (tempfile::TempDir, ExperimentFolder, [String; 2]) {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         (directory, folder, [0, 1].map(|cell: usize| plan.cells[cell].id.clone()))
     }
@@ -389,7 +394,7 @@ mod tests {
     }
 
     #[track_caller]
-    fn logs_of_a_group(folder: &Folder, [first, second]: &[String; 2]) {
+    fn logs_of_a_group(folder: &ExperimentFolder, [first, second]: &[String; 2]) {
         let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
         let order: WorkerJob = serde_json::from_str(&read(first, "orders")).unwrap();
         assert_eq!(order.cells.iter().map(|ordered| &ordered.cell).collect::<Vec<_>>(), [first, second]);

@@ -20,7 +20,7 @@ use perturb_text::{count, duration};
 
 use crate::cost::generated_episodes;
 use crate::eta::{CellDurations, RemainingTime, TrainingProgress, UnfinishedCell, remaining_time};
-use crate::folder::{CellState, Failure, FailureId, Folder};
+use crate::folder::{CellState, ExperimentFolder, FailureId, FailureRecord};
 use crate::plan::{Cell, Grouping, Plan, SELECTION_TEST, Tests};
 pub use event::{CellEvent, EventLine, EventLineWriter, JobCell, WorkerJob, write_line};
 pub use local::Local;
@@ -212,7 +212,7 @@ type Result<T, E = RunError> = std::result::Result<T, E>;
 /// [`RunError`] if the run cannot continue. The backend is stopped first.
 pub fn run(
     plan: &Plan,
-    folder: &Folder,
+    folder: &ExperimentFolder,
     backend: &mut dyn Backend,
     retryable: &HashMap<String, FailureId>,
     server_wait: Duration,
@@ -284,7 +284,7 @@ enum CellPhase {
 /// The state of a run: decides which cells the backend starts, and handles its events.
 struct Scheduler<'a> {
     plan: &'a Plan,
-    folder: &'a Folder,
+    folder: &'a ExperimentFolder,
     backend: &'a mut dyn Backend,
     report: &'a mut dyn FnMut(ProgressEvent<'_>),
     /// The state of each cell, by its index in the plan.
@@ -304,7 +304,7 @@ struct Scheduler<'a> {
 impl<'a> Scheduler<'a> {
     fn new(
         plan: &'a Plan,
-        folder: &'a Folder,
+        folder: &'a ExperimentFolder,
         backend: &'a mut dyn Backend,
         retryable: &HashMap<String, FailureId>,
         report: &'a mut dyn FnMut(ProgressEvent<'_>),
@@ -457,7 +457,7 @@ impl<'a> Scheduler<'a> {
             return Ok(());
         };
         if !self.settled(cell) {
-            place.write_failure(&Failure {
+            place.write_failure(&FailureRecord {
                 id: self.id(cell).to_owned(),
                 reason,
                 commit: crate::VERSION.into(),

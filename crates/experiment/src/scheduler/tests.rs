@@ -134,7 +134,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
 /// A plan with a temporary folder.
 struct Place {
     _directory: TempDir,
-    folder: Folder,
+    folder: ExperimentFolder,
     plan: Plan,
 }
 
@@ -170,7 +170,7 @@ impl Place {
 
     fn of(plan: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         Self { _directory: directory, folder, plan: Plan::parse("test", plan.into()).unwrap() }
     }
 
@@ -185,8 +185,12 @@ impl Place {
     }
 
     fn fail(&self, cell: usize) {
-        let failure =
-            Failure { id: self.id(cell).to_owned(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+        let failure = FailureRecord {
+            id: self.id(cell).to_owned(),
+            reason: "NaN".into(),
+            commit: "x".into(),
+            requires_restart: true,
+        };
         self.folder.cell(self.id(cell)).write_failure(&failure).unwrap();
     }
 

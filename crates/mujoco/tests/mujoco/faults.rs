@@ -128,13 +128,13 @@ fn a_wrong_model_is_refused_with_mujocos_reason() {
 
 #[test]
 fn names_that_do_not_exist_are_refused() {
-    use perturb_mujoco::Kind;
+    use perturb_mujoco::ElementKind;
     let model = Model::from_xml(PENDULUM).unwrap();
-    assert_eq!(model.id(Kind::Body, "rod"), Ok(1));
-    assert_eq!(model.id(Kind::Joint, "hinge"), Ok(0));
-    assert_eq!(model.id(Kind::Actuator, "motor"), Ok(0));
+    assert_eq!(model.id(ElementKind::Body, "rod"), Ok(1));
+    assert_eq!(model.id(ElementKind::Joint, "hinge"), Ok(0));
+    assert_eq!(model.id(ElementKind::Actuator, "motor"), Ok(0));
     for name in ["rope", "", "ro\0d"] {
-        assert_eq!(model.id(Kind::Body, name), Err(Error::UnknownName { kind: "body", name: name.to_owned() }));
+        assert_eq!(model.id(ElementKind::Body, name), Err(Error::UnknownName { kind: "body", name: name.to_owned() }));
     }
 }
 

@@ -1,6 +1,6 @@
 //! Arrays of models and simulations by name.
 
-use perturb_mujoco::{Field, Flags, Index, Kind, Model, Reading, Simulation};
+use perturb_mujoco::{DataField, ElementKind, Flags, Index, Model, ModelField, Simulation};
 
 const ARM: &str = r#"
 <mujoco>
@@ -29,35 +29,41 @@ fn simulation() -> Simulation {
 fn fields_are_the_numbers_of_the_text() {
     let simulation = simulation();
     let model = simulation.model();
-    assert_eq!(model.field(Field::Gravity), [0.0, 0.0, -9.8]);
-    assert_eq!(model.field(Field::Wind), [1.0, 2.0, 3.0]);
-    assert_eq!((model.field(Field::Density), model.field(Field::Viscosity)), (&[1.2][..], &[0.5][..]));
-    assert_eq!(model.field(Field::DofDamping)[0], 0.3);
-    assert_eq!(model.field(Field::DofArmature)[0], 0.1);
-    assert_eq!(model.field(Field::DofFrictionLoss)[0], 0.4);
-    assert_eq!(model.field(Field::JointStiffness), [2.0, 0.0, 0.0]);
-    assert_eq!(model.field(Field::ActuatorGear)[..6], [50.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
-    assert_eq!((model.field(Field::ActuatorGain)[10], model.field(Field::ActuatorBias)[11]), (7.0, -7.0));
-    assert_eq!(model.field(Field::ActuatorControlRange)[..2], [-2.0, 3.0]);
-    assert_eq!((model.field(Field::TendonStiffness), model.field(Field::TendonDamping)), (&[3.0][..], &[0.2][..]));
-    let upper = model.id(Kind::Geom, "upper").unwrap();
-    assert_eq!(model.field(Field::GeomFriction)[3 * upper..][..3], [0.7, 0.1, 0.2]);
-    let range = &model.field(Field::JointRange)[..2];
+    assert_eq!(model.field(ModelField::Gravity), [0.0, 0.0, -9.8]);
+    assert_eq!(model.field(ModelField::Wind), [1.0, 2.0, 3.0]);
+    assert_eq!((model.field(ModelField::Density), model.field(ModelField::Viscosity)), (&[1.2][..], &[0.5][..]));
+    assert_eq!(model.field(ModelField::DofDamping)[0], 0.3);
+    assert_eq!(model.field(ModelField::DofArmature)[0], 0.1);
+    assert_eq!(model.field(ModelField::DofFrictionLoss)[0], 0.4);
+    assert_eq!(model.field(ModelField::JointStiffness), [2.0, 0.0, 0.0]);
+    assert_eq!(model.field(ModelField::ActuatorGear)[..6], [50.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    assert_eq!((model.field(ModelField::ActuatorGain)[10], model.field(ModelField::ActuatorBias)[11]), (7.0, -7.0));
+    assert_eq!(model.field(ModelField::ActuatorControlRange)[..2], [-2.0, 3.0]);
+    assert_eq!(
+        (model.field(ModelField::TendonStiffness), model.field(ModelField::TendonDamping)),
+        (&[3.0][..], &[0.2][..])
+    );
+    let upper = model.id(ElementKind::Geom, "upper").unwrap();
+    assert_eq!(model.field(ModelField::GeomFriction)[3 * upper..][..3], [0.7, 0.1, 0.2]);
+    let range = &model.field(ModelField::JointRange)[..2];
     assert!((range[0] + 90f64.to_radians()).abs() < 1e-12 && (range[1] - 45f64.to_radians()).abs() < 1e-12);
-    assert_eq!(model.field(Field::KeyPositions), [0.1, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
-    assert_eq!(model.field(Field::BodyMass), model.body_mass());
+    assert_eq!(model.field(ModelField::KeyPositions), [0.1, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0]);
+    assert_eq!(model.field(ModelField::BodyMass), model.body_mass());
 }
 
 #[test]
 fn elements_have_names_and_types() {
     let simulation = simulation();
     let model = simulation.model();
-    let names: Vec<_> = (0..5).map(|id| model.name(Kind::Body, id)).collect();
+    let names: Vec<_> = (0..5).map(|id| model.name(ElementKind::Body, id)).collect();
     assert_eq!(names, [Some("world"), Some("upper"), Some("ball"), Some("box"), None]);
-    assert_eq!(model.name(Kind::Joint, 1), None, "it has no name");
-    assert_eq!(model.name(Kind::Keyframe, 0), Some("raised"));
-    assert_eq!(model.name(Kind::Tendon, 0), Some("string"));
-    assert_eq!((model.count(Kind::Site), model.count(Kind::Sensor), model.count(Kind::Pair)), (1, 2, 0));
+    assert_eq!(model.name(ElementKind::Joint, 1), None, "it has no name");
+    assert_eq!(model.name(ElementKind::Keyframe, 0), Some("raised"));
+    assert_eq!(model.name(ElementKind::Tendon, 0), Some("string"));
+    assert_eq!(
+        (model.count(ElementKind::Site), model.count(ElementKind::Sensor), model.count(ElementKind::Pair)),
+        (1, 2, 0)
+    );
     assert_eq!(model.index_array(Index::JointType), [3, 1, 0]);
     assert_eq!(model.index_array(Index::SensorDimension), [1, 3]);
     assert_eq!(model.flags(Flags::JointLimited), [1, 0, 0]);
@@ -70,11 +76,11 @@ fn readings_are_what_a_forward_computes() {
     simulation.qpos_mut()[0] = 0.5;
     simulation.ctrl_mut()[0] = 1.0;
     simulation.forward().unwrap();
-    assert_eq!(simulation.reading(Reading::Sensors)[0], 0.5);
-    assert_eq!(simulation.reading(Reading::Sensors)[1..], *simulation.reading(Reading::SitePositions));
-    assert_eq!(simulation.reading(Reading::Positions), simulation.qpos());
-    assert_eq!(simulation.reading(Reading::ActuatorForces)[0], 1.0);
-    assert_eq!(simulation.reading(Reading::BodyPositions)[3..6], simulation.xpos(1));
+    assert_eq!(simulation.reading(DataField::Sensors)[0], 0.5);
+    assert_eq!(simulation.reading(DataField::Sensors)[1..], *simulation.reading(DataField::SitePositions));
+    assert_eq!(simulation.reading(DataField::Positions), simulation.qpos());
+    assert_eq!(simulation.reading(DataField::ActuatorForces)[0], 1.0);
+    assert_eq!(simulation.reading(DataField::BodyPositions)[3..6], simulation.xpos(1));
 }
 
 #[test]
@@ -83,24 +89,27 @@ fn external_forces_are_computed_when_asked_for() {
     for _ in 0..1500 {
         simulation.step().unwrap();
     }
-    assert!(simulation.reading(Reading::BodyExternalForces).iter().all(|&force| force == 0.0));
+    assert!(simulation.reading(DataField::BodyExternalForces).iter().all(|&force| force == 0.0));
     simulation.external_forces().unwrap();
-    let up = simulation.reading(Reading::BodyExternalForces)[6 * 3 + 5];
+    let up = simulation.reading(DataField::BodyExternalForces)[6 * 3 + 5];
     // Wind of 3 m/s in air of viscosity 0.5 lifts the box by its drag, about 6 π 0.1 m · 0.5 · 3 m/s = 2.8 N.
     assert!((up - (8.0 * 9.8 - 2.8)).abs() < 0.5, "the floor carries the box of 8 kg: {up} N");
     simulation.clear_external_forces();
-    assert!(simulation.reading(Reading::BodyExternalForces).iter().all(|&force| force == 0.0));
+    assert!(simulation.reading(DataField::BodyExternalForces).iter().all(|&force| force == 0.0));
 }
 
 #[test]
 fn fields_of_one_simulation_can_be_given_to_another() {
     let (mut edited, mut other) = (simulation(), simulation());
-    let fields =
-        [&[Field::BodyMass, Field::DofArmature, Field::Gravity, Field::ActuatorGear][..], &Field::DERIVED].concat();
-    edited.field_mut(Field::BodyMass)[1] *= 2.0;
-    edited.field_mut(Field::DofArmature)[0] = 5.0;
-    edited.field_mut(Field::Gravity)[2] = -3.0;
-    edited.field_mut(Field::ActuatorGear)[0] = 9.0;
+    let fields = [
+        &[ModelField::BodyMass, ModelField::DofArmature, ModelField::Gravity, ModelField::ActuatorGear][..],
+        &ModelField::DERIVED,
+    ]
+    .concat();
+    edited.field_mut(ModelField::BodyMass)[1] *= 2.0;
+    edited.field_mut(ModelField::DofArmature)[0] = 5.0;
+    edited.field_mut(ModelField::Gravity)[2] = -3.0;
+    edited.field_mut(ModelField::ActuatorGear)[0] = 9.0;
     edited.set_const().unwrap();
     assert_ne!(edited.model().float_arrays(), other.model().float_arrays());
     let mut values = vec![f64::NAN; edited.model().n_fields(&fields)];
@@ -109,5 +118,5 @@ fn fields_of_one_simulation_can_be_given_to_another() {
     other.reset().unwrap();
     edited.reset().unwrap();
     assert_eq!(edited.model().float_arrays(), other.model().float_arrays());
-    assert_eq!(other.model().field(Field::Gravity), [0.0, 0.0, -3.0]);
+    assert_eq!(other.model().field(ModelField::Gravity), [0.0, 0.0, -3.0]);
 }

@@ -1,6 +1,6 @@
 //! Models that use files: the caller passes the content of the files, and none is read from the disk.
 
-use perturb_mujoco::{Error, Kind, Model};
+use perturb_mujoco::{ElementKind, Error, Model};
 
 /// A tetrahedron with three edges of 1 m along the axes, as binary STL.
 fn tetrahedron() -> Vec<u8> {
@@ -27,7 +27,7 @@ const MODEL: &str = r#"
 fn a_mesh_comes_from_the_given_bytes() {
     let mesh = tetrahedron();
     let model = Model::from_files(MODEL, &[("other.stl", b"unused"), ("m0.stl", &mesh)]).unwrap();
-    let body = model.id(Kind::Body, "corner").unwrap();
+    let body = model.id(ElementKind::Body, "corner").unwrap();
     let volume = model.body_mass()[body] / 1000.0;
     // MuJoCo stores the vertices as float32, relative to the centre of mass. The volume therefore has about eight exact
     // digits.

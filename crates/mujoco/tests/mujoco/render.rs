@@ -1,6 +1,6 @@
 //! Pictures of models. These tests need software OpenGL: Debian's libegl1 and libgl1-mesa-dri.
 
-use perturb_mujoco::{Camera, CameraView, Error, Model, Renderer};
+use perturb_mujoco::{Camera, CameraView, Error, Model, ModelRenderer};
 use std::{sync::Barrier, thread};
 
 /// A red ball and a blue ball. In the picture of [`CAMERA`] the red one is above and to the right of the blue one.
@@ -14,8 +14,8 @@ const BALLS: &str = r#"
 </mujoco>"#;
 const CAMERA: Camera = Camera { look_at: [0.0; 3], distance: 3.0, azimuth: 90.0, elevation: 0.0 };
 
-fn renderer(size: (u16, u16)) -> Renderer {
-    Renderer::new(Model::from_xml(BALLS).unwrap(), size).unwrap()
+fn renderer(size: (u16, u16)) -> ModelRenderer {
+    ModelRenderer::new(Model::from_xml(BALLS).unwrap(), size).unwrap()
 }
 
 fn pixel(picture: &[u8], (width, x, y): (usize, usize, usize)) -> [u8; 3] {

@@ -1,6 +1,6 @@
 //! One simulation can serve many states and edited models in turn, and earlier computations do not affect later ones.
 
-use perturb_mujoco::{Error, Kind, Model, Simulation, Warning};
+use perturb_mujoco::{ElementKind, Error, Model, Simulation, Warning};
 
 /// A block that slides and tips on the floor, with a flywheel that a motor turns. Euler's method integrates the
 /// flywheel's damping implicitly.
@@ -40,7 +40,7 @@ fn constants(simulation: &Simulation) -> Vec<f64> {
 
 /// Edits mass, inertia and friction, differently for each `number`.
 fn edit(simulation: &mut Simulation, number: usize) {
-    let block = simulation.model().id(Kind::Body, "block").unwrap();
+    let block = simulation.model().id(ElementKind::Body, "block").unwrap();
     let scale = 1.0 + number as f64;
     simulation.body_mass_mut()[block] *= scale;
     simulation.body_inertia_mut()[3 * block..][..3].iter_mut().for_each(|moment| *moment *= scale);

@@ -1,8 +1,8 @@
 //! Tests of players: noise, statistics and memories.
 
 use perturb_policy::{
-    ActionKind, Inputs, Normalisers, ObservationNormaliser, Player, PolicySpec, RewardNormaliser, Role, RunningMoments,
-    SlotEnd, StepOutcome,
+    ActionKind, Inputs, Normalisers, ObservationNormaliser, Player, PlayerRole, PolicySpec, RewardNormaliser,
+    RunningMoments, SlotEnd, StepOutcome,
 };
 use rstest::rstest;
 
@@ -10,7 +10,7 @@ const DISCRETE: ActionKind = ActionKind::Discrete { n: 2 };
 const GAMMA: f64 = 0.5;
 
 /// Creates a player of one environment whose observation is one number.
-fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers, role: Role) -> Player {
+fn player(episodes_per_trial: u32, with_outcomes: bool, normalisers: Normalisers, role: PlayerRole) -> Player {
     let inputs = Inputs::new(1, DISCRETE, 1, with_outcomes);
     let spec = PolicySpec { observation_size: inputs.size(), action: DISCRETE, hidden: vec![], lstm: None };
     let mut player = Player::new(&spec, inputs, 1, episodes_per_trial, normalisers, role);
@@ -51,7 +51,7 @@ fn the_return_that_rewards_are_divided_by_runs_over(
 ) {
     let rewards = Some(RewardNormaliser::new(1, GAMMA).running_on(runs_on));
     let normalisers = Normalisers { observations: None, rewards };
-    let mut player = player(episodes_per_trial, false, normalisers, Role::training(1));
+    let mut player = player(episodes_per_trial, false, normalisers, PlayerRole::training(1));
     let at = |player: &Player| player.normalisers().rewards.as_ref().expect("statistics").returns()[0];
     let mut returns: Vec<f64> = Vec::new();
     for t in 0..5 {
@@ -67,7 +67,7 @@ fn the_return_that_rewards_are_divided_by_runs_over(
 /// With noise of standard deviation 0.25, the policy's input follows N(1, 0.25²).
 #[test]
 fn only_training_sees_noise() {
-    let played = |noise: f64, role: Role| {
+    let played = |noise: f64, role: PlayerRole| {
         let moments = RunningMoments::from_parts(1 << 40, vec![1.0], vec![4.0 * (1u64 << 40) as f64]);
         let observations = Some(ObservationNormaliser::from_moments(moments));
         let mut player = player(1, false, Normalisers { observations, rewards: None }, role).with_noise(noise);
@@ -79,15 +79,15 @@ fn only_training_sees_noise() {
         let seen: Vec<f32> = (0..10_000).map(seen).collect();
         (seen, player)
     };
-    let (seen, player) = played(0.25, Role::training(1));
-    assert_eq!(seen, played(0.25, Role::training(1)).0);
+    let (seen, player) = played(0.25, PlayerRole::training(1));
+    assert_eq!(seen, played(0.25, PlayerRole::training(1)).0);
     let mean = seen.iter().sum::<f32>() / 1e4;
     let deviation = (seen.iter().map(|x| (x - mean).powi(2)).sum::<f32>() / 1e4).sqrt();
     assert!((mean - 1.0).abs() < 0.01 && (deviation - 0.25).abs() < 0.01, "{mean} {deviation}, four standard errors");
-    let (clean, without) = played(0.0, Role::training(1));
+    let (clean, without) = played(0.0, PlayerRole::training(1));
     assert!(clean.iter().all(|x| (x - 1.0).abs() < 1e-4), "no noise");
     assert_eq!(player.normalisers(), without.normalisers(), "statistics are of what was observed");
-    assert!(played(0.25, Role::testing(1, 0, 1)).0.iter().all(|x| (x - 1.0).abs() < 1e-4));
+    assert!(played(0.25, PlayerRole::testing(1, 0, 1)).0.iter().all(|x| (x - 1.0).abs() < 1e-4));
 }
 
 /// Plays two environments whose observations are always (3, 3). The step limit ends both first episodes in the same
@@ -98,7 +98,7 @@ fn final_observations_have_no_noise() {
         let spec = PolicySpec { observation_size: 2, action: DISCRETE, hidden: vec![], lstm: None };
         let inputs = Inputs::new(2, DISCRETE, 2, false);
         let none = Normalisers::default();
-        let mut player = Player::new(&spec, inputs, 2, 1, none, Role::training(1)).with_noise(noise);
+        let mut player = Player::new(&spec, inputs, 2, 1, none, PlayerRole::training(1)).with_noise(noise);
         player.load(&(0..spec.n_weights()).map(|i| i as f32 / 8.0).collect::<Vec<_>>()).expect("weights that fit");
         player.begin(&[3.0; 4], None).expect("observations");
         player.act().expect("actions");
@@ -128,9 +128,9 @@ fn final_observations_have_no_noise() {
 #[test]
 fn noise_continues_from_a_saved_state() {
     let none = || Normalisers::default();
-    let mut expected = player(1, false, none(), Role::training(1)).with_noise(1.0);
+    let mut expected = player(1, false, none(), PlayerRole::training(1)).with_noise(1.0);
     step(&mut expected, 0, 1, 1.0);
-    let mut resumed = player(1, false, none(), Role::training(2)).with_noise(1.0);
+    let mut resumed = player(1, false, none(), PlayerRole::training(2)).with_noise(1.0);
     resumed.restore(&expected.state().expect("a training's")).expect("a state that fits");
     for t in 1..4 {
         step(&mut expected, t, 1, 1.0);
@@ -150,7 +150,7 @@ fn tests_leave_statistics_unchanged() {
         observations: Some(ObservationNormaliser::from_moments(moments(8.0))),
         rewards: Some(RewardNormaliser::from_parts(GAMMA, vec![0.0], moments(200.0))),
     };
-    let mut player = player(2, true, normalisers.clone(), Role::testing(1, 0, 1));
+    let mut player = player(2, true, normalisers.clone(), PlayerRole::testing(1, 0, 1));
     for t in 0..3 {
         step(&mut player, t, 2, 20.0);
     }

@@ -10,7 +10,8 @@ use crate::report::{Report, ReportError, ReportInputs};
 const PLAN: &str = "environments = ['CartPole', 'Pendulum']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff', 'rc']";
 
-/// Makes a report of made-up results of `plan` and of `assessed`, passes the report to `of`, and returns the result of `of`.
+/// Makes a report of made-up results of `plan` and of `assessed`, passes the report to `of`, and returns the result of
+/// `of`.
 fn report<T>(plan: &Plan, assessed: &[ExternalEvaluation], of: impl Fn(&Report<'_>) -> T) -> T {
     let results = fixture::results(plan, |cell| Some(([f64::from(cell.run) + 90.0, 70.0, 50.0], 1.0)));
     let mut selections = results.select();
@@ -145,7 +146,7 @@ fn a_folder_is_an_experiment_or_an_assessment() {
     agent.write(&directory.path().join("agent"), false).unwrap();
     sources.add(&directory.path().join("agent")).unwrap();
     for name in ["one", "two"] {
-        let folder = perturb_experiment::Folder::new(&directory.path().join(name));
+        let folder = perturb_experiment::ExperimentFolder::new(&directory.path().join(name));
         folder.keep_plan(&Plan::parse("test", PLAN.into()).unwrap()).unwrap();
     }
     sources.add(&directory.path().join("one")).unwrap();

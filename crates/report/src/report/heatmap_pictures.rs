@@ -6,8 +6,8 @@ use std::ops::Range;
 use std::path::Path;
 
 use perturb_experiment::{
-    Folder, FolderError, HeatmapPlace, HeatmapRecord, MethodResults, NoHeatmap, Reported, distinct, heatmap_kinds,
-    heatmap_places,
+    ExperimentFolder, FolderError, HeatmapPlace, HeatmapRecord, MethodResults, NoHeatmap, Reported, distinct,
+    heatmap_kinds, heatmap_places,
 };
 use perturb_files::{delete, list};
 use perturb_protocol::Version;
@@ -31,8 +31,8 @@ pub struct HeatmapPictures {
     pub missing: Vec<NoHeatmap>,
 }
 
-/// A picture without its colour scale. All pictures of an environment share a colour scale, which depends on all of their
-/// heatmaps. The scale is therefore known only after all drafts are made.
+/// A picture without its colour scale. All pictures of an environment share a colour scale, which depends on all of
+/// their heatmaps. The scale is therefore known only after all drafts are made.
 struct Draft<'a> {
     environment: &'a str,
     method: &'a Method,
@@ -74,7 +74,7 @@ struct Origin {
 /// [`FolderError`] if a file exists but cannot be read.
 pub fn heatmap_pictures(
     selections: &[MethodResults<'_>],
-    folder: Option<&Folder>,
+    folder: Option<&ExperimentFolder>,
 ) -> Result<HeatmapPictures, FolderError> {
     let places = heatmap_places(selections);
     let of_cells = folder.map_or_else(|| Ok(BTreeMap::new()), |folder| heatmap_kinds(folder, &places))?;
@@ -117,7 +117,7 @@ pub fn heatmap_pictures(
 /// Reads the heatmap of a cell's policy.
 fn shown<'a>(
     place: &HeatmapPlace<'a>,
-    folder: Option<&Folder>,
+    folder: Option<&ExperimentFolder>,
     kind: Option<&HeatmapKind>,
 ) -> Result<ShownPolicy<'a>, FolderError> {
     let read = match folder.zip(kind) {

@@ -15,7 +15,7 @@ const PLAN: &str = "environments = ['Pendulum', 'Elsewhere']\nruns = 2
 /// any.
 fn folder(plan: &Plan, heatmap: impl Fn(&Cell) -> Option<Heatmap>) -> tempfile::TempDir {
     let directory = tempfile::tempdir().unwrap();
-    let folder = Folder::new(directory.path());
+    let folder = ExperimentFolder::new(directory.path());
     for cell in &plan.cells {
         write_atomically(&folder.cell(&cell.id).path().join("result.json"), b"{}").unwrap();
         if let Some(heatmap) = heatmap(cell) {
@@ -25,7 +25,7 @@ fn folder(plan: &Plan, heatmap: impl Fn(&Cell) -> Option<Heatmap>) -> tempfile::
     directory
 }
 
-fn store(folder: &Folder, cell: &Cell, heatmap: &Heatmap) {
+fn store(folder: &ExperimentFolder, cell: &Cell, heatmap: &Heatmap) {
     let Heatmap { axes, base, grid, episodes, fixed, .. } = heatmap.clone();
     let (parameters, seed) = (axes.map(|axis| axis.name), cell.config.common.seed);
     let options = HeatmapOptions { parameters, base, grid, episodes, seed, fixed };
@@ -37,7 +37,7 @@ fn panels(picture: &Picture) -> &HeatmapPanels {
     panels
 }
 
-fn pictures(plan: &Plan, folder: &Folder) -> HeatmapPictures {
+fn pictures(plan: &Plan, folder: &ExperimentFolder) -> HeatmapPictures {
     let results = fixture::results(plan, |_| Some(([0.0; 3], 0.0)));
     heatmap_pictures(&results.select(), Some(folder)).unwrap()
 }
@@ -66,7 +66,7 @@ fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
     let is_there = |cell: &Cell| version(cell) == Version::D || (version(cell) == Version::R && cell.run == 1);
     let made = |cell: &Cell| (is_of(cell, "Pendulum", "a2c") && is_there(cell)).then(|| trained(cell));
     let directory = folder(&plan, made);
-    let pictures = pictures(&plan, &Folder::new(directory.path()));
+    let pictures = pictures(&plan, &ExperimentFolder::new(directory.path()));
     assert_eq!(pictures.pictures.len(), 1, "nothing of PPO and in the other environment");
     let picture = &pictures.pictures[0];
     let panels = panels(picture);
@@ -115,7 +115,7 @@ fn returns_use_the_environments_scale() {
         _ => 5.0,
     };
     let directory = folder(&plan, |cell| Some(fixture::heatmap(2, |mass, _| (of(cell) + mass, 0.0))));
-    let folder = Folder::new(directory.path());
+    let folder = ExperimentFolder::new(directory.path());
     // One cell also has a heatmap of another kind: its other parameters are drawn from R.
     let cell = plan.cells.iter().find(|cell| is_of(cell, "Pendulum", "ppo")).unwrap();
     store(&folder, cell, &Heatmap { base: Version::R, ..fixture::heatmap(3, |_, _| (-9000.0, 0.0)) });
@@ -145,7 +145,7 @@ fn mean_needs_equal_points_and_episodes() {
     let first = fixture::heatmap(2, |_, _| (0.0, 0.0));
     for other in [fixture::heatmap(3, |_, _| (9.0, 9.0)), Heatmap { episodes: 5, ..first.clone() }] {
         let directory = folder(&plan, |cell| Some(if cell.run == 1 { first.clone() } else { other.clone() }));
-        let pictures = pictures(&plan, &Folder::new(directory.path()));
+        let pictures = pictures(&plan, &ExperimentFolder::new(directory.path()));
         assert!(panels(&pictures.pictures[0]).columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
         assert_eq!(pictures.missing, [NoHeatmap::NotAlike; 12]);
         assert!(pictures.pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
@@ -156,7 +156,7 @@ fn mean_needs_equal_points_and_episodes() {
 fn of_an_experiment_without_heatmaps_it_is_said_why() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let directory = tempfile::tempdir().unwrap();
-    let folder = Folder::new(directory.path());
+    let folder = ExperimentFolder::new(directory.path());
     let results = fixture::results(&plan, |cell| is_of(cell, "Pendulum", "a2c").then_some(([0.0; 3], 0.0)));
     let pictures = heatmap_pictures(&results.select(), Some(&folder)).unwrap();
     assert_eq!((pictures.pictures.len(), pictures.total), (0, 24));
@@ -190,9 +190,9 @@ fn external_agents_have_heatmap_pictures() {
     let results = fixture::results(&plan, |_| Some(([0.0; 3], 0.0)));
     let assessed = [agent(&[(Version::D, 2), (Version::E, 3)]), agent(&[(Version::D, 4)])];
     let mut selections = results.select();
-    let alone = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    let alone = heatmap_pictures(&selections, Some(&ExperimentFolder::new(directory.path()))).unwrap();
     add_assessed(&mut selections, &assessed);
-    let pictures = heatmap_pictures(&selections, Some(&Folder::new(directory.path()))).unwrap();
+    let pictures = heatmap_pictures(&selections, Some(&ExperimentFolder::new(directory.path()))).unwrap();
     let (here, elsewhere): (Vec<_>, Vec<_>) = pictures.pictures.into_iter().partition(|it| !it.name.contains("pushes"));
     assert_eq!(here, alone.pictures, "those of cells are the same");
     assert_eq!(elsewhere.len(), 1);

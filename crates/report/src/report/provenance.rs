@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 
 use perturb_experiment::{
-    Cell, Failure, MethodResults, Plan, Recorded, Results, Selection, Tuned, distinct, elsewhere,
+    Cell, FailureRecord, MethodResults, Plan, Recorded, Results, Selection, Tuned, distinct, elsewhere,
 };
 use perturb_records::ParameterCheck;
 use perturb_records::success::Rule;
@@ -32,7 +32,8 @@ pub(super) fn sentences(
     if cells > 0 {
         lines
             .push(format!("{done} of {cells} cells are done, {failed} failed, {} are missing.", cells - done - failed));
-        let reason = |failure: &Failure| format!("`{}` failed: {}.", failure.id, failure.reason.replace('\n', " "));
+        let reason =
+            |failure: &FailureRecord| format!("`{}` failed: {}.", failure.id, failure.reason.replace('\n', " "));
         lines.extend(results.failures().take(MAX_REASONS).map(reason));
         if failed > MAX_REASONS {
             lines.push(format!("The table of results has the reasons of all {failed} failures."));

@@ -4,8 +4,8 @@
 use std::path::{Path, PathBuf};
 
 use perturb_experiment::{
-    CellStates, EnvironmentCurves, ExportError, Folder, FolderError, Plan, PlanError, Recorded, Results, Selection,
-    StudyResults, add_assessed, export, judged_as_in, read_curves,
+    CellStates, EnvironmentCurves, ExperimentFolder, ExportError, FolderError, Plan, PlanError, Recorded, Results,
+    Selection, StudyResults, add_assessed, export, judged_as_in, read_curves,
 };
 use perturb_records::{
     ExternalEvaluation, ExternalEvaluationError, FILE, ParameterCheck, Records, RecordsError, ResultsTable,
@@ -24,7 +24,7 @@ const EXPORTED: &str = "experiment";
 #[derive(Clone, Debug, Default)]
 pub struct ReportInputs {
     /// The folder of the experiment; `None` if the report is of a study or of assessments alone.
-    pub folder: Option<Folder>,
+    pub folder: Option<ExperimentFolder>,
     /// The study of a results table; `None` if the report is of a folder or of assessments alone.
     pub study: Option<StudySource>,
     /// The selection rule to use in place of the plan's; `None` for the plan's own rule.
@@ -101,7 +101,7 @@ impl ReportInputs {
     /// # Errors
     /// [`ReportError`] if `path` is none of these, cannot be read, or is a second experiment.
     pub fn add(&mut self, path: &Path) -> Result<(), ReportError> {
-        let folder = Folder::new(path);
+        let folder = ExperimentFolder::new(path);
         if ExternalEvaluation::is_in(path) {
             self.assessed.push(ExternalEvaluation::read(path)?);
             return Ok(());
@@ -177,7 +177,7 @@ impl ReportInputs {
 impl StudySource {
     /// Exports the results in `folder` to a table in memory. Adds the comparisons of requested and applied parameters
     /// in recorded episodes to `checks`.
-    fn exported(folder: &Folder, checks: &mut Vec<ParameterCheck>) -> Result<Self, ReportError> {
+    fn exported(folder: &ExperimentFolder, checks: &mut Vec<ParameterCheck>) -> Result<Self, ReportError> {
         let plan = Plan::load(&folder.require_plan()?)?;
         let rows = export(&plan, folder, EXPORTED, |_, records| checks.push(records.agreement()))?;
         let mut table = ResultsTable::default();
@@ -191,7 +191,7 @@ impl StudySource {
     /// `exported` has already added them.
     fn add_episodes(
         &self,
-        folder: Option<&Folder>,
+        folder: Option<&ExperimentFolder>,
         results: &Results<'_>,
         recorded: &mut Recorded,
         checks: &mut Vec<ParameterCheck>,

@@ -1,4 +1,4 @@
-use perturb_experiment::{Cell, CellState, Failure, Folder, SELECTION_TEST};
+use perturb_experiment::{Cell, CellState, ExperimentFolder, FailureRecord, SELECTION_TEST};
 use perturb_protocol::Version;
 use perturb_records::{Difference, Metric, ParameterCheck, TestResult};
 use rstest::rstest;
@@ -48,7 +48,7 @@ fn results(plan: &Plan) -> Results<'_> {
         known.then(|| (easier.map(|rate| rate + f64::from(cell.run)), 1.0))
     });
     let (id, commit) = (plan.cells[0].id.clone(), String::new());
-    results.states[0] = CellState::Failed(Failure {
+    results.states[0] = CellState::Failed(FailureRecord {
         id,
         reason: "NaN in <loss> | after\n9 updates".into(),
         commit,
@@ -107,7 +107,7 @@ fn clean_report_names_rule_seeds_and_selection() {
         [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\ngrid = { n_steps = [64, 128] }";
     let plan = Plan::parse("test", text.into()).unwrap();
     let directory = tempfile::tempdir().unwrap();
-    let folder = Folder::new(directory.path());
+    let folder = ExperimentFolder::new(directory.path());
     let n_steps = |cell: &Cell| cell.config.table()["n_steps"].as_integer();
     for cell in plan.cells.iter().chain(&plan.candidates) {
         let (version, seed) = (cell.config.common.version, cell.config.common.seed);
@@ -115,7 +115,7 @@ fn clean_report_names_rule_seeds_and_selection() {
         let selected = n_steps(cell) == Some(128);
         if version == Version::R || (version, selected, seed) == (Version::D, true, 2) {
             place
-                .write_failure(&Failure {
+                .write_failure(&FailureRecord {
                     id: cell.id.clone(),
                     reason: "NaN".into(),
                     commit: "x".into(),

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use perturb_protocol::TypedRequest;
 use pyo3::prelude::*;
 
-use super::Session;
+use super::PythonSession;
 use super::transport::{SessionServer, Transport};
 use crate::embedded::poll_once;
 use crate::failure::{RequestFailure, TIMED_OUT, UNUSABLE, failure};
@@ -43,7 +43,7 @@ pub(super) struct OpenSession {
     pub(super) under_way: usize,
 }
 
-impl Session {
+impl PythonSession {
     pub(super) fn state(&self) -> MutexGuard<'_, SessionState> {
         unpoisoned(&self.state)
     }
@@ -187,7 +187,7 @@ impl Session {
     }
 }
 
-impl Drop for Session {
+impl Drop for PythonSession {
     fn drop(&mut self) {
         if std::process::id() != self.owner {
             // This process was forked, and the session is a copy of the parent's session. Leak it, because its locks
@@ -215,7 +215,7 @@ impl OpenSession {
 
 /// A guard of a busy session. When the guard is dropped, also by a panic, it ends the session, so that no session stays
 /// busy for ever. If the session continues, the caller passes the guard to [`std::mem::forget`].
-pub(super) struct BusyGuard<'a>(pub(super) &'a Session);
+pub(super) struct BusyGuard<'a>(pub(super) &'a PythonSession);
 
 impl Drop for BusyGuard<'_> {
     fn drop(&mut self) {

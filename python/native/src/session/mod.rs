@@ -33,7 +33,7 @@ use exchange::{BusyGuard, FORKS, OpenSession, SessionState, duration, explain, u
 use transport::SessionServer;
 
 pub use exchange::note_fork;
-pub use opened::Opened;
+pub use opened::PythonOpened;
 pub use transport::NamedServer;
 
 /// Maximum number of steps that may be sent before the first reply is received. It bounds the memory of stored replies.
@@ -51,8 +51,8 @@ type StepArrays<'py> = (
 type SingleStep<'py> = (Bound<'py, PyArray1<f32>>, f64, bool, bool, Bound<'py, PyDict>);
 
 /// A session with a server. It owns a batch of environments.
-#[pyclass(frozen, module = "perturb._native")]
-pub struct Session {
+#[pyclass(frozen, name = "Session", module = "perturb._native")]
+pub struct PythonSession {
     server: SessionServer,
     /// Maximum time to wait for a reply; `None` for no limit.
     timeout: Mutex<Option<Duration>>,
@@ -85,7 +85,7 @@ struct LastStep {
 }
 
 #[pymethods]
-impl Session {
+impl PythonSession {
     /// Makes a session with the server at an address, or with the embedded server. [`open`](Self::open) connects to it.
     /// `timeout` is the maximum time to wait for a reply. `keepalive` is the interval of keepalive pings and the
     /// maximum time to wait for their answer. Times are in seconds, and may be infinite. `action_size` is None for
@@ -182,7 +182,7 @@ impl Session {
         receipts: bool,
         reward_terms: bool,
         observe_parameters: bool,
-    ) -> PyResult<Opened> {
+    ) -> PyResult<PythonOpened> {
         self.require_own()?;
         let n = self.actions.num_envs;
         let request = proto::Open {
@@ -227,7 +227,7 @@ impl Session {
         *unpoisoned(&self.last) = LastStep { observations: opened.observations.clone(), ..LastStep::default() };
         std::mem::forget(unopened);
         self.put_back(py, Box::new(OpenSession { transport, runtime, labels, under_way: 0 }));
-        Ok(Opened {
+        Ok(PythonOpened {
             environment: perturb_protocol::catalogue::environment(&served).to_string(),
             observes_parameters: opened.observes_parameters,
             served: Arc::new(served),
@@ -443,7 +443,7 @@ impl Session {
     }
 }
 
-impl Session {
+impl PythonSession {
     /// Replaces the stored observations of the environments that the mask selects by `rows` `[M, O]`. An empty mask
     /// selects all. The caller has checked the length of `rows`.
     fn merge(&self, mask: &[u8], rows: &Bytes) {

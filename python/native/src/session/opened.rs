@@ -11,8 +11,8 @@ use crate::arrays;
 use crate::infos::Events;
 
 /// The reply to opening a session.
-#[pyclass(frozen, module = "perturb._native")]
-pub struct Opened {
+#[pyclass(frozen, name = "Opened", module = "perturb._native")]
+pub struct PythonOpened {
     /// The description of the opened environment, in the JSON format of the catalogue.
     #[pyo3(get)]
     pub(super) environment: String,
@@ -28,7 +28,7 @@ pub struct Opened {
 }
 
 #[pymethods]
-impl Opened {
+impl PythonOpened {
     /// The first observations, `[N, O]`.
     #[getter]
     fn observations<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f32>>> {
@@ -36,7 +36,7 @@ impl Opened {
     }
 }
 
-impl Opened {
+impl PythonOpened {
     /// Returns the server's description of the opened environment.
     pub fn served(&self) -> &Arc<proto::Environment> {
         &self.served

@@ -8,7 +8,7 @@ use super::{
     world::JoinedWorld,
 };
 use crate::{
-    env::{Catalogue, Distribution, EpisodeId, Receipt, shorten},
+    env::{Catalogue, Distribution, EpisodeId, EpisodeReceipt, shorten},
     proto::dm_env_rpc::v1::{
         DataType, Tensor, TensorSpec,
         extensions::properties::{
@@ -94,7 +94,7 @@ fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Proper
     all
 }
 
-fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&Receipt>) -> Vec<Property> {
+fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&EpisodeReceipt>) -> Vec<Property> {
     let (spec, runner) = (joined.world.spec(), &joined.runner);
     let new = Property::new;
     let hash = receipt.map(|receipt| receipt.model_hash.clone()).unwrap_or_default();

@@ -2,7 +2,7 @@
 
 use super::Error;
 use crate::{
-    env::{Distribution, EnvironmentSpec, EpisodeStart, Settings, Version},
+    env::{Distribution, EnvironmentSpec, EpisodeSettings, StartedEpisode, Version},
     pool::{Batch, BatchSettings, Pool, ResetEntry, StepResult},
     proto::dm_env_rpc::v1::EnvironmentStateType as State,
     server::audit::draws::DrawAuditor,
@@ -17,7 +17,7 @@ pub(super) struct Runner {
     phase: EpisodePhase,
     /// The first observation of the latest episode, f32 `[O]`.
     first: Bytes,
-    start: Option<EpisodeStart>,
+    start: Option<StartedEpisode>,
     seed: u64,
     version: Version,
 }
@@ -80,7 +80,7 @@ impl Runner {
     }
 
     /// The settings of episodes with which the world was created.
-    pub(super) fn episodes(&self) -> &Settings {
+    pub(super) fn episodes(&self) -> &EpisodeSettings {
         &self.batch.settings().groups[0].episodes
     }
 
@@ -95,7 +95,7 @@ impl Runner {
     }
 
     /// The start of the latest episode, with its receipt.
-    pub(super) fn start(&self) -> Option<&EpisodeStart> {
+    pub(super) fn start(&self) -> Option<&StartedEpisode> {
         self.start.as_ref()
     }
 
@@ -188,7 +188,7 @@ fn state(terminated: bool, interrupted: bool) -> State {
 }
 
 /// Returns the start of the only environment's episode, if an episode began.
-fn only(started: Vec<(u32, EpisodeStart)>) -> Option<EpisodeStart> {
+fn only(started: Vec<(u32, StartedEpisode)>) -> Option<StartedEpisode> {
     started.into_iter().next().map(|(_, start)| start)
 }
 

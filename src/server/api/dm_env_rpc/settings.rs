@@ -4,7 +4,7 @@
 use super::{Error, tensors};
 use crate::{
     env::{self, Catalogue, Distribution, EnvironmentSpec, Version, disturbance, resolve, shorten},
-    pool::{Autoreset, BatchSettings, SlotGroup},
+    pool::{Autoreset, BatchSettings, SlotGroupSettings},
     proto::dm_env_rpc::v1::Tensor,
 };
 use std::collections::BTreeMap;
@@ -70,7 +70,7 @@ pub(super) fn create(
     let version = version(settings)?.unwrap_or(Version::D);
     let mut distributions = spec.distributions(version);
     resolve(spec, &mut distributions, parameters(spec, settings)?)?;
-    let episodes = env::Settings {
+    let episodes = env::EpisodeSettings {
         seed: integer(SEED, 0, 0, u64::MAX)?,
         environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
         distributions,
@@ -80,7 +80,7 @@ pub(super) fn create(
     let autoreset = Autoreset::Disabled;
     let batch = BatchSettings {
         spec,
-        groups: vec![SlotGroup { size: 1, episodes }],
+        groups: vec![SlotGroupSettings { size: 1, episodes }],
         autoreset,
         receipts: true,
         receipt_arrays: false,

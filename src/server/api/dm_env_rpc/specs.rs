@@ -2,7 +2,7 @@
 
 use super::{Error, runner::WorldStep, tensors};
 use crate::{
-    env::{ActionSpace, Channel, EnvironmentSpec},
+    env::{ActionSpec, ChannelSpec, EnvironmentSpec},
     proto::dm_env_rpc::v1::{
         ActionObservationSpecs, DataType, StepResponse, Tensor, TensorSpec,
         tensor::{BoolArray, FloatArray, Int32Array, Payload},
@@ -37,12 +37,12 @@ pub(super) fn action_observation_specs(spec: &EnvironmentSpec) -> ActionObservat
     let observation =
         TensorSpec { shape: length(spec.observation), min, max, ..scalar("observation", DataType::Float) };
     let action = match spec.action {
-        ActionSpace::Discrete(names) => {
+        ActionSpec::Discrete(names) => {
             let bound =
                 |choice| Some(Value { payload: Some(value::Payload::Int32s(Int32Array { array: vec![choice] })) });
             TensorSpec { min: bound(0), max: bound(last(names)), ..scalar("action", DataType::Int32) }
         }
-        ActionSpace::Continuous(channels) => {
+        ActionSpec::Continuous(channels) => {
             let (min, max) = bounds(channels);
             TensorSpec { shape: length(channels), min, max, ..scalar("action", DataType::Float) }
         }
@@ -83,11 +83,11 @@ pub(super) fn actions(spec: &EnvironmentSpec, actions: &BTreeMap<u64, Tensor>) -
         Error::value(field.clone(), "missing", "a tensor: every step while an episode runs takes an action")
     })?;
     Ok(match spec.action {
-        ActionSpace::Discrete(names) => {
+        ActionSpec::Discrete(names) => {
             let choice = tensors::int32s(&field, tensor, &[], &[(0, last(names))])?;
             choice.iter().flat_map(|x| x.to_le_bytes()).collect()
         }
-        ActionSpace::Continuous(channels) => {
+        ActionSpec::Continuous(channels) => {
             let bounds: Vec<_> = channels.iter().map(|c| (c.low as f32, c.high as f32)).collect();
             let vector = tensors::floats(&field, tensor, &[channels.len()], &bounds)?;
             vector.iter().flat_map(|x| x.to_le_bytes()).collect()
@@ -126,19 +126,19 @@ fn last(names: &[&str]) -> i32 {
     names.len() as i32 - 1
 }
 
-fn length(channels: &[Channel]) -> Vec<i32> {
+fn length(channels: &[ChannelSpec]) -> Vec<i32> {
     vec![channels.len() as i32]
 }
 
 /// Returns the minima and maxima of the channels, or `None` if any is infinite. If all channels have the same bounds,
 /// there is only one minimum and one maximum.
-fn bounds(channels: &[Channel]) -> (Option<Value>, Option<Value>) {
+fn bounds(channels: &[ChannelSpec]) -> (Option<Value>, Option<Value>) {
     if !channels.iter().all(|c| c.low.is_finite() && c.high.is_finite()) {
         return (None, None);
     }
     let alike = channels.windows(2).all(|w| (w[0].low, w[0].high) == (w[1].low, w[1].high));
     let shown = if alike { &channels[..channels.len().min(1)] } else { channels };
-    let value = |bound: fn(&Channel) -> f64| {
+    let value = |bound: fn(&ChannelSpec) -> f64| {
         let array = shown.iter().map(|c| bound(c) as f32).collect();
         Some(Value { payload: Some(value::Payload::Floats(FloatArray { array })) })
     };

@@ -4,10 +4,11 @@
 use super::Error;
 use crate::{
     env::{
-        self, Achievement, ActionSpace, Catalogue, Channel, Comparison, Distribution, EnvironmentSpec, EpisodeEnd,
-        EpisodeId, EpisodeStart, Parameter, Receipt, Settings, Success, Version, disturbance, resolve,
+        self, Achievement, ActionSpec, Catalogue, ChannelSpec, Distribution, EnvironmentSpec, EpisodeId,
+        EpisodeReceipt, EpisodeSettings, FinishedEpisode, ParameterSpec, StartedEpisode, SuccessComparison,
+        SuccessRuleSpec, Version, disturbance, resolve,
     },
-    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroup, StepResult},
+    pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroupSettings, StepResult},
     proto,
     render::Size,
 };
@@ -89,7 +90,7 @@ fn group(
     path: &str,
     size_field: &str,
     group: proto::SlotGroup,
-) -> Result<SlotGroup, Error> {
+) -> Result<SlotGroupSettings, Error> {
     let version = Version::from_proto(group.version()).ok_or_else(|| {
         let expected = "VERSION_DEFAULT (1), VERSION_RANDOM (2), VERSION_EXTREME (3) or VERSION_RANDOM_OR_EXTREME (4)";
         Error::value(format!("{path}.version"), group.version, expected)
@@ -105,13 +106,13 @@ fn group(
     }
     let mut distributions = spec.distributions(version);
     override_parameters(spec, &mut distributions, &group.parameters)?;
-    let episodes = Settings {
+    let episodes = EpisodeSettings {
         seed: group.seed,
         environment_index: first,
         distributions,
         episodes_per_trial: group.episodes_per_trial.max(1),
     };
-    Ok(SlotGroup { size: group.size as usize, episodes })
+    Ok(SlotGroupSettings { size: group.size as usize, episodes })
 }
 
 /// Replaces the distributions in `base` of all parameters that `parameters` names.
@@ -136,8 +137,8 @@ fn override_parameters(
 pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(), Error> {
     const FIELD: &str = "step.actions";
     let (element, width) = match spec.action {
-        ActionSpace::Discrete(_) => ("int32 [N]", 1),
-        ActionSpace::Continuous(channels) => ("float32 [N, A]", channels.len()),
+        ActionSpec::Discrete(_) => ("int32 [N]", 1),
+        ActionSpec::Continuous(channels) => ("float32 [N, A]", channels.len()),
     };
     if actions.len() != 4 * width * size {
         let expected = format!("{} bytes: {element} with N = {size}, A = {width}", 4 * width * size);
@@ -145,14 +146,14 @@ pub fn actions(spec: &EnvironmentSpec, size: usize, actions: &Bytes) -> Result<(
     }
     let words = actions.as_chunks::<4>().0;
     match spec.action {
-        ActionSpace::Discrete(names) => {
+        ActionSpec::Discrete(names) => {
             let legal = |word: &[u8; 4]| (0..names.len() as i32).contains(&i32::from_le_bytes(*word));
             if let Some(slot) = words.iter().position(|word| !legal(word)) {
                 let got = format!("{} in slot {slot}", i32::from_le_bytes(words[slot]));
                 return Err(Error::value(FIELD, got, format!("a choice in 0 … {}", names.len() - 1)));
             }
         }
-        ActionSpace::Continuous(_) => {
+        ActionSpec::Continuous(_) => {
             if let Some(i) = words.iter().position(|word| !f32::from_le_bytes(*word).is_finite()) {
                 let got = format!("{} in slot {}, entry {}", f32::from_le_bytes(words[i]), i / width, i % width);
                 return Err(Error::value(FIELD, got, "finite numbers"));
@@ -220,7 +221,7 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
     }
     let numbers: Vec<f64> = bytes.as_chunks::<8>().0.iter().map(|word| f64::from_le_bytes(*word)).collect();
     for (i, &x) in numbers.iter().enumerate() {
-        let Channel { name, unit, low, high, .. } = spec.state[i % n];
+        let ChannelSpec { name, unit, low, high, .. } = spec.state[i % n];
         if !x.is_finite() || x < low || x > high {
             let got = format!("{x} {unit} for {name} in row {}", i / n);
             return Err(Error::value(FIELD, got, format!("a finite number within [{low}, {high}]")));
@@ -273,8 +274,8 @@ pub fn render(n: usize, request: proto::Render) -> Result<(usize, Size), Error> 
 
 /// Makes an environment's entry in the catalogue.
 pub fn environment(spec: &'static EnvironmentSpec, model_hash: &str) -> proto::Environment {
-    let quantity = |q: &env::Quantity| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
-    let term = |t: &env::RewardTerm| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
+    let quantity = |q: &env::QuantitySpec| proto::Quantity { name: q.name.into(), unit: q.unit.into() };
+    let term = |t: &env::RewardTermSpec| proto::RewardTerm { name: t.name.into(), description: t.description.into() };
     proto::Environment {
         name: spec.name.into(),
         revision: spec.revision,
@@ -296,12 +297,12 @@ pub fn environment(spec: &'static EnvironmentSpec, model_hash: &str) -> proto::E
     }
 }
 
-fn success(rule: &Success, step_limit: u32) -> proto::Success {
-    let Success { description, achievement, comparison, threshold } = *rule;
-    let env::Quantity { name, unit } = rule.quantity();
+fn success(rule: &SuccessRuleSpec, step_limit: u32) -> proto::Success {
+    let SuccessRuleSpec { description, achievement, comparison, threshold } = *rule;
+    let env::QuantitySpec { name, unit } = rule.quantity();
     let comparison = match comparison {
-        Comparison::AtLeast => proto::Comparison::AtLeast,
-        Comparison::AtMost => proto::Comparison::AtMost,
+        SuccessComparison::AtLeast => proto::Comparison::AtLeast,
+        SuccessComparison::AtMost => proto::Comparison::AtMost,
     };
     proto::Success {
         description: description.into(),
@@ -313,12 +314,13 @@ fn success(rule: &Success, step_limit: u32) -> proto::Success {
     }
 }
 
-fn channels(channels: &[Channel]) -> Vec<proto::Channel> {
-    let channel = |c: &Channel| proto::Channel { name: c.name.into(), unit: c.unit.into(), low: c.low, high: c.high };
+fn channels(channels: &[ChannelSpec]) -> Vec<proto::Channel> {
+    let channel =
+        |c: &ChannelSpec| proto::Channel { name: c.name.into(), unit: c.unit.into(), low: c.low, high: c.high };
     channels.iter().map(channel).collect()
 }
 
-fn parameter(p: &Parameter) -> proto::Parameter {
+fn parameter(p: &ParameterSpec) -> proto::Parameter {
     proto::Parameter {
         name: p.name.into(),
         unit: p.unit.into(),
@@ -333,7 +335,7 @@ fn parameter(p: &Parameter) -> proto::Parameter {
     }
 }
 
-fn parameter_observation(p: &Parameter) -> proto::ParameterObservation {
+fn parameter_observation(p: &ParameterSpec) -> proto::ParameterObservation {
     let whole = p.whole();
     let bound = |value| f64::from(p.observed(value));
     proto::ParameterObservation {
@@ -348,13 +350,13 @@ fn parameter_observation(p: &Parameter) -> proto::ParameterObservation {
     }
 }
 
-fn action_space(space: ActionSpace) -> proto::ActionSpace {
+fn action_space(space: ActionSpec) -> proto::ActionSpace {
     use proto::action_space::Kind;
     let kind = match space {
-        ActionSpace::Discrete(names) => {
+        ActionSpec::Discrete(names) => {
             Kind::Discrete(proto::Discrete { names: names.iter().map(|name| (*name).into()).collect() })
         }
-        ActionSpace::Continuous(list) => Kind::Continuous(proto::Continuous { channels: channels(list) }),
+        ActionSpec::Continuous(list) => Kind::Continuous(proto::Continuous { channels: channels(list) }),
     };
     proto::ActionSpace { kind: Some(kind) }
 }
@@ -376,8 +378,8 @@ pub fn stepped(stepped: StepResult) -> proto::Stepped {
 }
 
 /// Converts the starts of episodes, each with its slot.
-pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
-    let start = |(slot, start): (u32, EpisodeStart)| proto::EpisodeStart {
+pub fn started(episodes: Vec<(u32, StartedEpisode)>) -> Vec<proto::EpisodeStart> {
+    let start = |(slot, start): (u32, StartedEpisode)| proto::EpisodeStart {
         slot,
         episode: Some(episode(start.id)),
         receipt: start.receipt.map(receipt),
@@ -385,7 +387,7 @@ pub fn started(episodes: Vec<(u32, EpisodeStart)>) -> Vec<proto::EpisodeStart> {
     episodes.into_iter().map(start).collect()
 }
 
-pub(super) fn ended((slot, end): (u32, EpisodeEnd)) -> proto::EpisodeEnd {
+pub(super) fn ended((slot, end): (u32, FinishedEpisode)) -> proto::EpisodeEnd {
     proto::EpisodeEnd {
         slot,
         episode: Some(episode(end.id)),
@@ -404,7 +406,7 @@ fn episode(id: EpisodeId) -> proto::Episode {
     proto::Episode { environment_index, trial_index, episode_index, episode_in_trial }
 }
 
-fn receipt(receipt: Receipt) -> proto::Receipt {
-    let Receipt { requested, applied, model_hash } = receipt;
+fn receipt(receipt: EpisodeReceipt) -> proto::Receipt {
+    let EpisodeReceipt { requested, applied, model_hash } = receipt;
     proto::Receipt { requested, applied, model_hash }
 }

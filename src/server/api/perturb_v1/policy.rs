@@ -2,12 +2,14 @@
 
 use super::{Error, convert};
 use crate::{
-    env::ActionSpace,
-    pool::{Autoreset, Batch, EndedAt, Policy, PolicyRole, PolicyRunner, Rollout, RolloutRequest},
+    env::ActionSpec,
+    pool::{Autoreset, Batch, PolicyRole, PolicyRunner, ReceivedPolicy, Rollout, RolloutEpisodeEnd, RolloutRequest},
     proto,
 };
 use bytes::Bytes;
-use perturb_policy::{ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, PlayerState, PolicySpec};
+use perturb_policy::{
+    ActionKind, CollectUntil, Inputs, Normalisers, ObservationNormaliser, PlayerTrainingState, PolicySpec,
+};
 use perturb_protocol::player::{DecodeError, player_state, read_floats};
 use rand_chacha::ChaCha8Rng;
 
@@ -49,8 +51,8 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
         return Err(order("in a session whose groups have trials of different lengths", advice));
     };
     let action = match settings.spec.action {
-        ActionSpace::Discrete(names) => ActionKind::Discrete { n: names.len() },
-        ActionSpace::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
+        ActionSpec::Discrete(names) => ActionKind::Discrete { n: names.len() },
+        ActionSpec::Continuous(channels) => ActionKind::Continuous { size: channels.len() },
     };
     let observation = settings.observation_size();
     let parameters = observation - settings.spec.observation.len();
@@ -113,7 +115,12 @@ fn task(task: Option<proto::act::Task>) -> Result<Option<CollectUntil>, Error> {
     }
 }
 
-fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial: u32) -> Result<Policy, Error> {
+fn policy(
+    policy: proto::Policy,
+    given: &Bytes,
+    sizes: Sizes,
+    episodes_per_trial: u32,
+) -> Result<ReceivedPolicy, Error> {
     let inputs = Inputs::new(sizes.observation, sizes.action, sizes.envs, policy.outcomes);
     let spec = spec(&policy, inputs.size(), sizes)?;
     let weights = weights(given, &spec)?;
@@ -141,7 +148,7 @@ fn policy(policy: proto::Policy, given: &Bytes, sizes: Sizes, episodes_per_trial
             return Err(Error::value("act.policy.state", "given in testing", "none: each trial begins anew"));
         }
     };
-    Ok(Policy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
+    Ok(ReceivedPolicy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
 }
 
 /// Checks the layer sizes of a policy whose input has `input_size` numbers.
@@ -201,7 +208,7 @@ fn state(
     extra: usize,
     memory_size: usize,
     actions: ChaCha8Rng,
-) -> Result<PlayerState, Error> {
+) -> Result<PlayerTrainingState, Error> {
     let n = sizes.envs;
     if given.starts.len() != n {
         let got = format!("{} bytes", given.starts.len());
@@ -241,7 +248,7 @@ pub fn rollout_response(rollout: Rollout) -> proto::Acted {
     }
 }
 
-fn ended_at(EndedAt { step, slot, end, terminated, truncated }: EndedAt) -> proto::EndedAt {
+fn ended_at(RolloutEpisodeEnd { step, slot, end, terminated, truncated }: RolloutEpisodeEnd) -> proto::EndedAt {
     proto::EndedAt { step: step as u32, end: Some(convert::ended((slot, end))), terminated, truncated }
 }
 

@@ -2,7 +2,7 @@
 //! beforehand.
 
 use crate::{
-    env::{self, ActionSpace},
+    env::{self, ActionSpec},
     pool::{Autoreset, Batch, BatchSettings, RolloutRequest},
     proto,
     render::Size,
@@ -33,8 +33,8 @@ fn receipt_bytes(settings: &BatchSettings) -> usize {
 /// Returns A, the number of entries of an action.
 fn action_width(settings: &BatchSettings) -> usize {
     match settings.spec.action {
-        ActionSpace::Discrete(_) => 1,
-        ActionSpace::Continuous(channels) => channels.len(),
+        ActionSpec::Discrete(_) => 1,
+        ActionSpec::Continuous(channels) => channels.len(),
     }
 }
 

@@ -18,7 +18,7 @@ use super::job::QueuedJob;
 use super::options::SlurmOptions;
 use super::script::script;
 use super::submission::{self, Submission};
-use crate::folder::Folder;
+use crate::folder::ExperimentFolder;
 use crate::plan::{Grouping, Plan, distinct};
 
 /// Maximum number of different non-job lines of squeue that are reported to the user.
@@ -28,7 +28,7 @@ const MAX_FOREIGN_LINES: usize = 10;
 /// with the same folder finds them again.
 pub struct Jobs<'a> {
     plan: &'a Plan,
-    folder: &'a Folder,
+    folder: &'a ExperimentFolder,
     slurm: &'a Slurm,
     options: &'a SlurmOptions,
     costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,
@@ -75,7 +75,7 @@ impl<'a> Jobs<'a> {
     /// the plan. `costs` is called at most once, before the first submission that needs it.
     pub fn new(
         plan: &'a Plan,
-        folder: &'a Folder,
+        folder: &'a ExperimentFolder,
         slurm: &'a Slurm,
         options: &'a SlurmOptions,
         costs: &'a dyn Fn() -> Result<Vec<f64>, AnyError>,

@@ -8,7 +8,7 @@ use serde::{Deserialize, Serialize};
 
 use super::job::QueuedJob;
 use crate::folder;
-use crate::folder::{Folder, FolderError};
+use crate::folder::{ExperimentFolder, FolderError};
 use crate::plan::Plan;
 
 /// The file with the cell ids of each job, one job per line.
@@ -44,12 +44,12 @@ pub(super) struct SlurmNames {
 const MAX_CELLS_BYTES: u64 = 64 << 20;
 
 /// Returns the folder of all submissions.
-pub(super) fn directory(folder: &Folder) -> PathBuf {
+pub(super) fn directory(folder: &ExperimentFolder) -> PathBuf {
     folder.path().join("slurm")
 }
 
 /// Reads all complete submissions, oldest first.
-pub(super) fn list(folder: &Folder) -> Result<Vec<Submission>, FolderError> {
+pub(super) fn list(folder: &ExperimentFolder) -> Result<Vec<Submission>, FolderError> {
     let directory = directory(folder);
     let mut submissions = Vec::new();
     for number in numbers(&directory)? {
@@ -78,7 +78,7 @@ fn read(path: &Path, number: u32) -> Result<Option<Submission>, FolderError> {
 /// Writes the files of a new submission, which can then be sent to Slurm. Writes `submission.json` last, which makes
 /// the submission complete. `script` returns the job script, given the folder of the submission.
 pub(super) fn create(
-    folder: &Folder,
+    folder: &ExperimentFolder,
     plan: &Plan,
     jobs: Vec<Vec<String>>,
     script: &dyn Fn(&Path) -> Result<String, super::SlurmError>,
@@ -139,7 +139,7 @@ mod tests {
     #[test]
     fn submissions_are_numbered_and_read_back() {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(directory.path());
+        let folder = ExperimentFolder::new(directory.path());
         assert!(list(&folder).unwrap().is_empty());
         let jobs = |ids: &[&[&str]]| -> Vec<Vec<String>> {
             ids.iter().map(|job| job.iter().map(|id| (*id).to_owned()).collect()).collect()

@@ -15,7 +15,7 @@ use tempfile::TempDir;
 use super::super::{Backend, ProgressEvent, RunEnd, RunError, Scheduler};
 use super::submission::{self, Submission};
 use super::{JobCommand, Jobs, Slurm, SlurmOptions};
-use crate::folder::{Failure, Folder};
+use crate::folder::{ExperimentFolder, FailureRecord};
 use crate::plan::Plan;
 
 /// A plan with four cells of two kinds.
@@ -68,7 +68,7 @@ pub(super) fn options() -> SlurmOptions {
 
 struct Fake {
     directory: TempDir,
-    folder: Folder,
+    folder: ExperimentFolder,
     plan: Plan,
     options: SlurmOptions,
     limit: Duration,
@@ -94,7 +94,7 @@ pub(super) fn install(path: &Path, text: &str) {
 impl Fake {
     fn new() -> Self {
         let directory = tempfile::tempdir().unwrap();
-        let folder = Folder::new(&directory.path().join("out"));
+        let folder = ExperimentFolder::new(&directory.path().join("out"));
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let limit = Duration::from_secs(60);
         let fake =
@@ -397,7 +397,8 @@ fn failed_cells_are_tried_again_on_request_only() {
     ids[1..].iter().for_each(|id| fake.finish(id));
     let failed = fake.folder.cell(&ids[0]);
     fs::create_dir_all(failed.training()).unwrap();
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+    let failure =
+        FailureRecord { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
     failed.write_failure(&failure).unwrap();
     assert_eq!(fake.run().unwrap(), RunEnd::Finished { failed: vec![ids[0].clone()] });
     assert!(fake.submissions().is_empty());
@@ -415,7 +416,8 @@ fn failed_cell_is_retried_while_its_array_runs() {
     (fake.options.cells_per_job, fake.plan) = (Some(4), of_one_kind());
     let ids = fake.ids();
     assert_eq!(fake.run_until("submitted 4 cells as Slurm job 1: 1 job").unwrap(), stopped(&["1"]));
-    let failure = Failure { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
+    let failure =
+        FailureRecord { id: ids[0].clone(), reason: "NaN".into(), commit: "x".into(), requires_restart: true };
     fake.folder.cell(&ids[0]).write_failure(&failure).unwrap();
     fake.retry_failed = true;
     assert_eq!(fake.run_until("submitted 1 cell as Slurm job 2").unwrap(), stopped(&["1", "2"]));
