@@ -60,8 +60,8 @@ for server in "${servers[@]}"; do
 done
 say "nobody is root, both servers are healthy"
 
-# now CONTAINER: prints the number of a server's open sessions, which it reads from the server's metrics.
-now() {
+# open_sessions CONTAINER: prints the number of a server's open sessions, which it reads from the server's metrics.
+open_sessions() {
     docker exec "$1" bash -c 'exec 3<>/dev/tcp/127.0.0.1/9447; printf "GET /metrics HTTP/1.0\r\n\r\n" >&3; cat <&3' |
         sed -n 's/^perturb_sessions{} \([0-9]*\).*/\1/p'
 }
@@ -70,7 +70,7 @@ now() {
 catch_session() {
     docker pause "${learners[@]}" >/dev/null || fail "the learners ended before a server could be stopped"
     for index in 0 1; do
-        if [ "$(now "${servers[index]}")" -gt 0 ]; then
+        if [ "$(open_sessions "${servers[index]}")" -gt 0 ]; then
             stopped=${servers[index]} other=${servers[1 - index]}
             return 0
         fi
@@ -80,7 +80,7 @@ catch_session() {
 }
 wait_for "a session" catch_session
 left=$((cells - $(results broken)))
-say "the learners are paused; open sessions: $(now "$stopped") on the server that is stopped, $(now "$other") on the other one"
+say "the learners are paused; open sessions: $(open_sessions "$stopped") on the server that is stopped, $(open_sessions "$other") on the other one"
 docker stop "$stopped" >/dev/null
 code=$(inspect '{{.State.ExitCode}}' "$stopped")
 [ "$code" = 0 ] || fail "the stopped server ended with status $code"

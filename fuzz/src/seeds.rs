@@ -33,7 +33,7 @@ pub(crate) fn stored_policy() -> Checkpoint {
 /// Returns the recorded episodes of the policy [`POLICY`].
 pub(crate) fn stored_records() -> Records {
     let path = StudyEpisodes::path(&repository_path("results"), "beyond/confirm-2");
-    let episodes = StudyEpisodes::read_if_there(&path).expect("readable").expect("a file");
+    let episodes = StudyEpisodes::read_if_exists(&path).expect("readable").expect("a file");
     episodes.of_cell(POLICY).expect("the policy's episodes").clone()
 }
 

@@ -5,7 +5,7 @@ use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 
 use perturb_experiment::runs::{AssessmentStatus, LEADS_OUT, RunSummary};
-use perturb_files::{Stamp, leads_out, list};
+use perturb_files::{Stamp, escapes_root, list};
 use perturb_text::shortened;
 
 /// The state of an assessment at the last refresh.
@@ -31,7 +31,7 @@ impl LiveAssessment {
     pub(crate) fn refresh(&mut self) {
         let files = list(&self.path).unwrap_or_default();
         let names = files.iter().filter_map(|path| path.file_name());
-        if let Some(name) = names.into_iter().find(|name| leads_out(&self.root, &self.path, name)) {
+        if let Some(name) = names.into_iter().find(|name| escapes_root(&self.root, &self.path, name)) {
             let status = Err(format!("{} is {LEADS_OUT}", Path::new(name).display()));
             *self = Self { status, ..Self::new(&self.root, &self.path) };
             return;

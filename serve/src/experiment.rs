@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use perturb_experiment::runs::{CellStatus, ExperimentStatus, LEADS_OUT, RunSummary, last_progress};
 use perturb_experiment::{Cell, generated_episodes, tested_episodes};
-use perturb_files::{self as files, Stamp, leads_out};
+use perturb_files::{self as files, Stamp, escapes_root};
 use perturb_records::{self as records};
 use perturb_text::shortened;
 use serde::Serialize;
@@ -40,7 +40,7 @@ pub(crate) struct LiveExperiment {
     stamps: [Option<Stamp>; 2],
     status: Result<ExperimentStatus, String>,
     /// Time at which a cell was last seen running.
-    worked: Option<Instant>,
+    last_running: Option<Instant>,
     /// Trainings of the first [`MAX_CURVES`] running cells, by the cells' ids.
     trainings: HashMap<String, LiveTraining>,
     /// Progress of all running cells, by their ids.
@@ -98,7 +98,7 @@ impl LiveExperiment {
             read_duration: Duration::ZERO,
             stamps: [None; 2],
             status: Err("it was not read yet".into()),
-            worked: None,
+            last_running: None,
             trainings: HashMap::new(),
             progress: HashMap::new(),
             eta: Eta::default(),
@@ -131,7 +131,7 @@ impl LiveExperiment {
             self.status = Err(shortened(error.to_string()));
         }
         if self.status.as_ref().is_ok_and(|status| status.state() == "in work") {
-            self.worked = Some(Instant::now());
+            self.last_running = Some(Instant::now());
         }
         self.read_progress();
         self.read = Some(Instant::now());
@@ -145,7 +145,7 @@ impl LiveExperiment {
         for id in working(status) {
             let file = Path::new("cells").join(id).join("training/progress.csv");
             let mut progress = before.remove(id).unwrap_or_default();
-            let stamp = Stamp::read(&self.path.join(&file)).filter(|_| !leads_out(&self.root, &self.path, &file));
+            let stamp = Stamp::read(&self.path.join(&file)).filter(|_| !escapes_root(&self.root, &self.path, &file));
             if stamp != progress.stamp {
                 let last = stamp.and_then(|_| last_progress(&self.path.join(&file)));
                 progress = CellProgress { stamp, episodes: last.and_then(|last| last.episodes()).unwrap_or_default() };
@@ -158,7 +158,7 @@ impl LiveExperiment {
     pub(crate) fn refresh_details(&mut self) {
         self.refresh();
         let Ok(status) = &self.status else { return self.trainings.clear() };
-        let is_inside = |id: &str| !leads_out(&self.root, &self.path, Path::new("cells").join(id).join("training"));
+        let is_inside = |id: &str| !escapes_root(&self.root, &self.path, Path::new("cells").join(id).join("training"));
         // Refreshes the learning curves of running cells.
         let first: Vec<&str> = working(status).filter(|id| is_inside(id)).take(MAX_CURVES).collect();
         self.trainings.retain(|id, _| first.contains(&id.as_str()));
@@ -207,7 +207,7 @@ impl LiveExperiment {
     pub(crate) fn state(&self) -> &'static str {
         let Ok(status) = &self.status else { return "not understood" };
         let has_open_cells = status.cells.iter().any(|cell| !cell.is_settled());
-        let worked_lately = self.worked.is_some_and(|worked| worked.elapsed() < BETWEEN_CELLS);
+        let worked_lately = self.last_running.is_some_and(|last_running| last_running.elapsed() < BETWEEN_CELLS);
         if has_open_cells && worked_lately { "in work" } else { status.state() }
     }
 
@@ -312,7 +312,7 @@ impl ReportFiles {
         let folder = status.folder.path();
         let mut add = |path: &Path| {
             let name = path.strip_prefix(folder).unwrap_or(path);
-            if outside.is_none() && leads_out(root, folder, name) {
+            if outside.is_none() && escapes_root(root, folder, name) {
                 outside = Some(name.display().to_string());
             }
             (name, Stamp::read(path)).hash(&mut hasher);

@@ -18,7 +18,7 @@ use tokio_stream::wrappers::WatchStream;
 
 use crate::connections::ClientAddress;
 use crate::error::ViewError;
-use crate::links::WayUp;
+use crate::links::RelativeRoot;
 use crate::paths::{RelativePath, Root};
 use crate::publisher::{EventData, Publisher, Topic};
 use crate::report::ReportCache;
@@ -82,7 +82,7 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
 /// Refuses methods other than GET and HEAD, unknown host names, and requests that a page of another site caused. Makes
 /// the links of message pages relative, and adds the security headers to each response.
 async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
-    let way_up = WayUp::from_path(request.uri().path());
+    let relative_root = RelativeRoot::from_path(request.uri().path());
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut response =
             pages::message_page(StatusCode::METHOD_NOT_ALLOWED, "This server changes nothing; use GET or HEAD.");
@@ -99,7 +99,8 @@ async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next)
         next.run(request).await
     };
     if let Some(MessagePage(text)) = response.extensions_mut().remove() {
-        response = (response.status(), response.headers().clone(), Html(way_up.relative_links(&text))).into_response();
+        response =
+            (response.status(), response.headers().clone(), Html(relative_root.relative_links(&text))).into_response();
     }
     let security_headers = [
         (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
@@ -143,7 +144,7 @@ fn is_known_host(headers: &HeaderMap, uri: &Uri, hosts: &[String]) -> bool {
 
 async fn index(State(state): State<Arc<AppState>>) -> Response {
     match state.publisher.view(&Topic::Index).await {
-        Ok(view) => page(&pages::index::page(&state.root, &view.update), &WayUp::from_index()),
+        Ok(view) => page(&pages::index::page(&state.root, &view.update), &RelativeRoot::from_index()),
         Err(error) => error_page(&error),
     }
 }
@@ -155,14 +156,14 @@ async fn run(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
         return Redirect::permanent(&format!("../{}", RelativePath::default().join(name).encode())).into_response();
     }
     match state.publisher.view(&Topic::Run(relative.clone())).await {
-        Ok(view) => page(&pages::run_page(&state.root, &relative, &view.update), &WayUp::from_run(&relative)),
+        Ok(view) => page(&pages::run_page(&state.root, &relative, &view.update), &RelativeRoot::from_run(&relative)),
         Err(error) => error_page(&error),
     }
 }
 
 async fn curves(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     let Some(chosen) = chosen_trainings(&uri) else { return error_page(&ViewError::RunNotFound) };
-    page(&pages::curves::page(&state.root, &chosen), &WayUp::from_index())
+    page(&pages::curves::page(&state.root, &chosen), &RelativeRoot::from_index())
 }
 
 /// Streams the events of the list of all runs. If the query names trainings, streams the events of their curves instead.
@@ -255,8 +256,8 @@ fn chosen_trainings(uri: &Uri) -> Option<Vec<RelativePath>> {
     names.split(',').take(pages::curves::MAX_TRAININGS).map(RelativePath::decode).collect()
 }
 
-fn page(text: &str, way_up: &WayUp) -> Response {
-    Html(way_up.relative_links(text)).into_response()
+fn page(text: &str, relative_root: &RelativeRoot) -> Response {
+    Html(relative_root.relative_links(text)).into_response()
 }
 
 #[cfg(test)]

@@ -10,9 +10,9 @@ const ATTRIBUTES: [&str; 3] = ["href=\"", "src=\"", "data-events=\""];
 
 /// The relative path from a page to the root of the site, such as `./` or `../../`.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct WayUp(String);
+pub(crate) struct RelativeRoot(String);
 
-impl WayUp {
+impl RelativeRoot {
     /// Returns the relative path to the root from the page with the list of all runs.
     pub(crate) fn from_index() -> Self {
         Self::from_path("/")
@@ -53,9 +53,9 @@ mod tests {
     #[case("/nothing", "./")]
     #[case("/report/a/b/", "../../../")]
     fn the_way_up_follows_from_the_address(#[case] path: &str, #[case] way: &str) {
-        assert_eq!(WayUp::from_path(path), WayUp(way.into()));
+        assert_eq!(RelativeRoot::from_path(path), RelativeRoot(way.into()));
         if let Some(run) = path.strip_prefix("/run/") {
-            assert_eq!(WayUp::from_run(&RelativePath::decode(run).unwrap()), WayUp(way.into()));
+            assert_eq!(RelativeRoot::from_run(&RelativePath::decode(run).unwrap()), RelativeRoot(way.into()));
         }
     }
 
@@ -63,6 +63,6 @@ mod tests {
     fn links_become_relative_and_texts_stay() {
         let html = r#"<a href="/run/a">href=&quot;/x</a><img src="/file/b.png"><body data-events="/events"><a href="https://x/">"#;
         let expected = r#"<a href="../run/a">href=&quot;/x</a><img src="../file/b.png"><body data-events="../events"><a href="https://x/">"#;
-        assert_eq!(WayUp::from_path("/run/a").relative_links(html), expected);
+        assert_eq!(RelativeRoot::from_path("/run/a").relative_links(html), expected);
     }
 }

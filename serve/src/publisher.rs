@@ -16,7 +16,7 @@ use crate::error::ViewError;
 use crate::experiment::LiveExperiment;
 use crate::index::Index;
 use crate::keyed_cache::KeyedCache;
-use crate::links::WayUp;
+use crate::links::RelativeRoot;
 use crate::pages::curves::ChartedTraining;
 use crate::pages::{self, Update};
 use crate::paths::{RelativePath, Root};
@@ -107,11 +107,11 @@ impl Publisher {
     fn load(&self, topic: &Topic) -> Result<Arc<View>, ViewError> {
         self.runs.remove_idle();
         self.loaders.remove_idle(ViewLoader::is_loading);
-        let way_up = match topic {
-            Topic::Index | Topic::Curves(_) => WayUp::from_index(),
-            Topic::Run(relative) => WayUp::from_run(relative),
+        let relative_root = match topic {
+            Topic::Index | Topic::Curves(_) => RelativeRoot::from_index(),
+            Topic::Run(relative) => RelativeRoot::from_run(relative),
         };
-        let update = self.update(topic)?.with_relative_links(&way_up);
+        let update = self.update(topic)?.with_relative_links(&relative_root);
         let event = update.to_json().into();
         Ok(Arc::new(View { update, event }))
     }

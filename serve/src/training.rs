@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use perturb_experiment::runs::{LEADS_OUT, LastProgress, RunSummary, TrainingStatus};
 use perturb_experiment::{CellResult, CellState, ExperimentFolder, FolderError, generated_episodes};
-use perturb_files::{Stamp, is_locked, leads_out};
+use perturb_files::{Stamp, escapes_root, is_locked};
 use perturb_text::shortened;
 
 use crate::curve::{EpisodeLog, LearningCurve};
@@ -45,7 +45,7 @@ impl LiveTraining {
 
     /// Reads the status again if its files have changed, or if a process has taken or released the training's lock.
     pub(crate) fn refresh(&mut self) {
-        if let Some(name) = READ_FILES.into_iter().find(|name| leads_out(&self.root, &self.path, name)) {
+        if let Some(name) = READ_FILES.into_iter().find(|name| escapes_root(&self.root, &self.path, name)) {
             *self = Self { status: Err(format!("{name} is {LEADS_OUT}")), ..Self::new(&self.root, &self.path) };
             return;
         }
@@ -128,7 +128,7 @@ impl LiveTraining {
 
     /// Returns the names of the training's text files that exist and may be sent.
     pub(crate) fn files(&self) -> impl Iterator<Item = &'static str> {
-        let may_be_sent = |name: &&str| self.path.join(name).is_file() && !leads_out(&self.root, &self.path, name);
+        let may_be_sent = |name: &&str| self.path.join(name).is_file() && !escapes_root(&self.root, &self.path, name);
         ["config.toml", "monitor.csv", "progress.csv"].into_iter().filter(may_be_sent)
     }
 
@@ -141,7 +141,9 @@ impl LiveTraining {
             // Files of an experiment outside of the served folder are not read.
             return None;
         }
-        if let Some(name) = ["result.json", "failure.json"].into_iter().find(|name| leads_out(&self.root, cell, name)) {
+        if let Some(name) =
+            ["result.json", "failure.json"].into_iter().find(|name| escapes_root(&self.root, cell, name))
+        {
             return Some(Err(format!("{name} of the cell is {LEADS_OUT}")));
         }
         match ExperimentFolder::new(experiment).cell(cell.file_name()?.to_str()?).state() {

@@ -2,7 +2,7 @@
 
 use super::{
     Achievement, Action, Distribution, Draw, DrawPurpose, Environment, EnvironmentSpec, PhiloxStream,
-    seen::SeenParameters,
+    observed_parameters::ObservedParameters,
 };
 use crate::scene::Scene;
 
@@ -118,7 +118,7 @@ pub struct Episodes {
     pub(super) values: Vec<f64>,
     pub(super) progress: EpisodeProgress,
     /// The parameters at the end of each observation; `None` if observations do not include them.
-    pub(super) seen: Option<Box<SeenParameters>>,
+    pub(super) observed_parameters: Option<Box<ObservedParameters>>,
 }
 
 /// Returns into how many boxes, 1 or 2, `distributions` distributions can be divided if each box has `n`. Returns
@@ -139,7 +139,8 @@ impl Episodes {
             "settings.distributions has one distribution for each parameter in each box"
         );
         let values = vec![0.0; n];
-        let mut episodes = Self { environment, settings, values, progress: EpisodeProgress::default(), seen: None };
+        let mut episodes =
+            Self { environment, settings, values, progress: EpisodeProgress::default(), observed_parameters: None };
         episodes.start(None);
         episodes
     }
@@ -147,7 +148,7 @@ impl Episodes {
     /// Makes every observation end with the parameters, scaled by
     /// [`ParameterSpec::observed`](super::ParameterSpec::observed).
     pub fn observing_parameters(mut self) -> Self {
-        self.seen = Some(Box::new(SeenParameters::new(self.environment.as_ref())));
+        self.observed_parameters = Some(Box::new(ObservedParameters::new(self.environment.as_ref())));
         self
     }
 
@@ -213,7 +214,7 @@ impl Episodes {
                 *value = parameter.draw(distribution, stream.unit());
             }
             self.environment.set_parameters(&self.values);
-            self.see_parameters();
+            self.update_observed_parameters();
         }
         let episode = self.progress.episode;
         self.environment.set_address(Draw { seed, environment_index, episode_index: episode }, 0);
@@ -250,15 +251,16 @@ impl Episodes {
     }
 
     /// Updates the observed parameters, if there are any. Call this method after the environment's parameters were set.
-    pub(super) fn see_parameters(&mut self) {
-        if let Some(seen) = &mut self.seen {
-            seen.read(self.environment.as_ref());
+    pub(super) fn update_observed_parameters(&mut self) {
+        if let Some(observed_parameters) = &mut self.observed_parameters {
+            observed_parameters.read(self.environment.as_ref());
         }
     }
 
     /// Writes the current observation to `out`, including the observed parameters.
     pub fn observe(&self, out: &mut [f32]) {
-        let entries = self.seen.as_ref().map_or(&[][..], |seen| seen.entries());
+        let entries =
+            self.observed_parameters.as_ref().map_or(&[][..], |observed_parameters| observed_parameters.entries());
         let (state, parameters) = out.split_at_mut(out.len() - entries.len());
         self.environment.observe(state);
         parameters.copy_from_slice(entries);

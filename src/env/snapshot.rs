@@ -100,7 +100,7 @@ impl Episodes {
             return Err(error);
         }
         self.values = saved.values;
-        self.see_parameters();
+        self.update_observed_parameters();
         self.progress = saved.progress;
         self.settings = EpisodeSettings {
             seed: saved.seed,

@@ -8,12 +8,13 @@
 //! - `model` draws MuJoCo models, with colours, floor, light and sky.
 
 mod canvas;
+mod fair_queue;
 #[cfg(feature = "mujoco")]
 mod model;
-mod turns;
 
 use crate::{meters::Histogram, priority::lower, scene::Scene};
 use bytes::Bytes;
+use fair_queue::FairQueue;
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
     sync::{Arc, Mutex, PoisonError},
@@ -21,7 +22,6 @@ use std::{
     time::Duration,
 };
 use tokio::{sync::oneshot, time::Instant};
-use turns::Turns;
 
 /// Scheduling priority (niceness) of the drawing thread and of the graphics driver's threads. The threads for physics
 /// have a higher priority.
@@ -79,7 +79,7 @@ pub struct Renderer {
 
 /// The drawing thread and its queue.
 struct DrawingThread {
-    jobs: Arc<Turns<PictureJob>>,
+    jobs: Arc<FairQueue<PictureJob>>,
     handle: JoinHandle<()>,
 }
 
@@ -114,12 +114,12 @@ impl Renderer {
         picture.await.map_err(|_| Error::Defect)?.map(Bytes::from)
     }
 
-    fn jobs(&self) -> Result<Arc<Turns<PictureJob>>, Error> {
+    fn jobs(&self) -> Result<Arc<FairQueue<PictureJob>>, Error> {
         let mut running = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(thread) = &*running {
             return Ok(Arc::clone(&thread.jobs));
         }
-        let jobs = Arc::new(Turns::new());
+        let jobs = Arc::new(FairQueue::new());
         let (own, times) = (Arc::clone(&jobs), self.times());
         let handle = thread::Builder::new()
             .name("render".into())
@@ -148,7 +148,7 @@ impl Drop for Renderer {
 }
 
 /// The drawing thread: draws the pictures in the queue until it is closed.
-fn work(jobs: &Turns<PictureJob>, times: &Histogram) {
+fn work(jobs: &FairQueue<PictureJob>, times: &Histogram) {
     lower(NICENESS);
     let mut cache = Cache::default();
     while let Some(PictureJob { scene, size, reply }) = jobs.pop() {

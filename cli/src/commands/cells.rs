@@ -32,7 +32,7 @@ pub(super) struct PlanRunner<'a> {
     /// Failed cells of an earlier run, by id. --retry-failed runs them again.
     retryable: HashMap<String, FailureId>,
     /// Outcome of the previous round; `None` before the first round.
-    end: Option<RunEnd>,
+    last_outcome: Option<RunEnd>,
     /// Success rates of the finished cells, by kind of cell (environment, method and training set).
     rates: Vec<Rate>,
     /// Output for the cells' events as JSON lines.
@@ -49,16 +49,16 @@ impl<'a> PlanRunner<'a> {
         stop: &'a StopFlag,
     ) -> Result<Self> {
         let events = args.json.as_deref().map(json::event_writer).transpose()?;
-        keep_plan(args, &plan, folder)?;
+        store_plan(args, &plan, folder)?;
         let retryable = if args.retry_failed { folder.failures()? } else { HashMap::new() };
-        Ok(Self { args, folder, done, stop, plan, retryable, end: None, rates: Vec::new(), events })
+        Ok(Self { args, folder, done, stop, plan, retryable, last_outcome: None, rates: Vec::new(), events })
     }
 
     /// Returns the plan of the next round. In the first round it is the given plan. In the second round it also has the
     /// cells that tuning selected. Cells that are finished in the table of --done are left out. Returns `None` when no
     /// round is left.
     pub(super) fn next_round(&mut self) -> Result<Option<Plan>> {
-        match self.end {
+        match self.last_outcome {
             None => {}
             Some(RunEnd::Stopped { .. }) => return Ok(None),
             Some(RunEnd::Finished { .. }) => {
@@ -91,10 +91,11 @@ impl<'a> PlanRunner<'a> {
             ProgressEvent::Note(sentence) => note(sentence),
             ProgressEvent::Line(line) => self.events.iter_mut().for_each(|out| write_line(out, line)),
         };
-        let end = run_plan(plan, self.folder, backend, &self.retryable, self.args.wait.time(), self.stop, &mut report);
+        let last_outcome =
+            run_plan(plan, self.folder, backend, &self.retryable, self.args.wait.time(), self.stop, &mut report);
         drop(display);
         self.rates = rates;
-        self.end = Some(end.map_err(|error| match error {
+        self.last_outcome = Some(last_outcome.map_err(|error| match error {
             RunError::NoServer(_) => CommandError::Failed(format!("{error}; resume with: {}", this_command())),
             error => error.into(),
         })?);
@@ -103,13 +104,13 @@ impl<'a> PlanRunner<'a> {
 
     /// Prints the result and returns the exit status.
     pub(super) fn finish(self) -> Result<ExitCode> {
-        let Self { args, folder, plan, end, rates, .. } = self;
+        let Self { args, folder, plan, last_outcome, rates, .. } = self;
         rates.iter().take(MAX_RATES).for_each(note);
         if rates.len() > MAX_RATES {
             note(format_args!("and {} more: perturb report {}", rates.len() - MAX_RATES, quoted(folder.path())));
         }
         // After a signal, print how to resume. Otherwise find the failed cells.
-        let failed = match end {
+        let failed = match last_outcome {
             Some(RunEnd::Stopped { signal, left }) => {
                 let jobs = left.join(" ");
                 note(format_args!("stopped by signal {signal}; resume with: {}", this_command()));
@@ -166,12 +167,12 @@ pub(super) fn without_done(mut plan: Plan, done: Option<&DoneCells<'_>>) -> Resu
 
 /// Copies the plan into its folder, and prints a note if it replaces another plan. With --cell an existing plan is not
 /// replaced: the command may be a queued job, whose plan is older than the plan in the folder.
-fn keep_plan(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> Result<()> {
+fn store_plan(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> Result<()> {
     let path = folder.plan_path();
     if !args.cell.is_empty() && path.exists() {
         return Ok(());
     }
-    if folder.keep_plan(plan)? {
+    if folder.store_plan(plan)? {
         note(format_args!("{} was another plan and is replaced; the cells of both plans are kept", path.display()));
     }
     Ok(())

@@ -45,7 +45,7 @@ struct NamedPolicies {
 }
 
 /// A comparison, with the rule of success if it is known.
-type Judged = (EnvironmentComparison, Option<String>);
+type ComparisonWithRule = (EnvironmentComparison, Option<String>);
 
 pub(super) fn run(args: &CompareArgs) -> Result<()> {
     args.json.check()?;
@@ -80,7 +80,7 @@ pub(super) fn run(args: &CompareArgs) -> Result<()> {
 }
 
 /// Compares policies that are tested now or have recorded episodes.
-fn tested_comparison(args: &CompareArgs, score: ComparedScore) -> Result<Judged> {
+fn tested_comparison(args: &CompareArgs, score: ComparedScore) -> Result<ComparisonWithRule> {
     let conditions = args.conditions.iter().map(|text| condition(text)).collect::<Result<Vec<_>>>()?;
     let sets = tested_sets(args, &conditions)?;
     let tested = test(args, conditions, &sets)?;

@@ -118,7 +118,7 @@ pub(super) struct Display {
     unit: &'static str,
     total: u64,
     /// For a training: its progress, and the total number of episodes that it will generate.
-    pace: Option<(TrainingProgress, f64)>,
+    training_progress: Option<(TrainingProgress, f64)>,
     start: Instant,
     last_line: Option<Instant>,
 }
@@ -134,10 +134,10 @@ impl Display {
     /// Makes the display of a training that has already finished this number of episodes and steps.
     pub(super) fn for_training(what: String, config: &TrainConfig, episodes: u64, timesteps: u64) -> Self {
         let budget = config.common.episodes;
-        let mut pace = TrainingProgress::default();
-        pace.update(generated_episodes(config, episodes), timesteps);
+        let mut training_progress = TrainingProgress::default();
+        training_progress.update(generated_episodes(config, episodes), timesteps);
         let mut display = Self::for_episodes(what, budget);
-        display.pace = Some((pace, generated_episodes(config, budget)));
+        display.training_progress = Some((training_progress, generated_episodes(config, budget)));
         display
     }
 
@@ -155,16 +155,16 @@ impl Display {
         let bar = (std::io::stderr().is_terminal() && !is_quiet()).then(|| Bar::new(&what, total));
         // A training or test prints its first line after one interval, so a short one prints no line.
         let last_line = (unit == "episodes").then(Instant::now);
-        Self { bar, what, unit, total, pace: None, start: Instant::now(), last_line }
+        Self { bar, what, unit, total, training_progress: None, start: Instant::now(), last_line }
     }
 
     /// Shows the progress after an iteration of a training.
     pub(super) fn training(&mut self, progress: &Progress) {
         let mut figures = Vec::new();
-        if let Some((pace, total)) = &mut self.pace {
-            pace.update(progress.generated_episodes as f64, progress.timesteps);
-            let ratio = pace.remaining_ratio(*total);
-            let bound = if pace.is_lower_bound(*total) { "at least " } else { "" };
+        if let Some((training_progress, total)) = &mut self.training_progress {
+            training_progress.update(progress.generated_episodes as f64, progress.timesteps);
+            let ratio = training_progress.remaining_ratio(*total);
+            let bound = if training_progress.is_lower_bound(*total) { "at least " } else { "" };
             figures.extend(self.remaining_time(ratio).map(|time| format!("{bound}{time}")));
         }
         if let Some(EpisodeFigures { episode_return, success, .. }) = progress.recent {

@@ -23,7 +23,7 @@ pub(super) fn run(args: &ExportArgs) -> Result<()> {
         ResultsTable::read(&args.into)?
     } else {
         require_writable(&args.into)?;
-        ResultsTable::read_if_there(&args.into)?.unwrap_or_default()
+        ResultsTable::read_if_exists(&args.into)?.unwrap_or_default()
     };
     // The folder of each study, by the study's name.
     let mut folders: BTreeMap<String, &Path> = BTreeMap::new();
@@ -79,7 +79,7 @@ fn add(args: &ExportArgs, table: &mut ResultsTable, study: &str, dir: &Path) -> 
     let path = StudyEpisodes::path(beside, study);
     let mut episodes = StudyEpisodes::default();
     if args.policies {
-        episodes = StudyEpisodes::read_if_there(&path)?.unwrap_or_default();
+        episodes = StudyEpisodes::read_if_exists(&path)?.unwrap_or_default();
     }
     let before = episodes.policies();
     let keep = |id: &str, records: Records| {

@@ -81,20 +81,20 @@ fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell>
 fn run_worker(args: &RunArgs, folder: &ExperimentFolder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
     std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
-    let order: WorkerJob = serde_json::from_str(&text)
+    let job: WorkerJob = serde_json::from_str(&text)
         .map_err(|error| CommandError::Usage(format!("the job on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
-    let mut writer = EventLineWriter::new(order.cells.len(), std::io::stdout());
+    let mut writer = EventLineWriter::new(job.cells.len(), std::io::stdout());
     // Find the cells of the job in the plan. If one is missing, refuse the whole job.
     let plan = Plan::load(&args.plan);
-    let mut orders = Vec::new();
-    for JobCell { cell: id, retry } in &order.cells {
+    let mut job_cells = Vec::new();
+    for JobCell { cell: id, retry } in &job.cells {
         let cell = match &plan {
             Ok(plan) => find_cell(args, plan, id).map_err(|error| error.to_string()),
             Err(error) => Err(error.to_string()),
         };
         match cell {
-            Ok(cell) => orders.push(CellJob { cell, folder: folder.cell(&cell.id), retry: *retry }),
+            Ok(cell) => job_cells.push(CellJob { cell, folder: folder.cell(&cell.id), retry: *retry }),
             Err(reason) => {
                 writer.write(id, CellEvent::Refused { reason });
                 return Ok(ExitCode::SUCCESS);
@@ -102,18 +102,18 @@ fn run_worker(args: &RunArgs, folder: &ExperimentFolder, stop: &StopFlag) -> Res
         }
     }
     let mut tell = |cell: &Cell, event| writer.write(&cell.id, event);
-    match Servers::connect_to_one(&args.server.server, order.turn, stop) {
+    match Servers::connect_to_one(&args.server.server, job.turn, stop) {
         Ok(servers) => {
-            for order in &orders {
+            for job in &job_cells {
                 for address in servers.addresses() {
-                    tell(order.cell, CellEvent::Server { address: address.to_string() });
+                    tell(job.cell, CellEvent::Server { address: address.to_string() });
                 }
             }
-            run_cells(&servers, &orders, stop, &mut tell);
+            run_cells(&servers, &job_cells, stop, &mut tell);
         }
         Err(error) => {
             let reason = error.to_string();
-            orders.iter().for_each(|order| tell(order.cell, CellEvent::LostServer { reason: reason.clone() }));
+            job_cells.iter().for_each(|job| tell(job.cell, CellEvent::LostServer { reason: reason.clone() }));
         }
     }
     Ok(ExitCode::SUCCESS)

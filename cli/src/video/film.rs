@@ -163,7 +163,7 @@ struct Film<'a> {
     caption: Caption,
     caption_text: CaptionText,
     /// Whether a picture of the current state was requested, and whether a picture of the next state was requested.
-    pictured: [bool; 2],
+    picture_requested: [bool; 2],
     /// The last picture that was received.
     last: Option<RenderedPicture>,
     frame: Vec<u8>,
@@ -206,7 +206,7 @@ impl<'a> Film<'a> {
             ended: Vec::new(),
             reply,
             caption_text: CaptionText::default(),
-            pictured: [true, true],
+            picture_requested: [true, true],
             last: None,
             frame: Vec::new(),
             fps: options.fps.unwrap_or(1.0 / (f64::from(options.every) * environment.control_timestep)),
@@ -215,7 +215,7 @@ impl<'a> Film<'a> {
             caption,
             environment,
         };
-        film.announce();
+        film.reset_caption();
         film.request_picture()?;
         Ok(film)
     }
@@ -234,7 +234,7 @@ impl<'a> Film<'a> {
             // The next step is requested before the picture of this state arrives, so that server and client work in
             // parallel.
             let next = self.request_next()?;
-            self.expose(writer)?;
+            self.write_frame(writer)?;
             match next {
                 NextRequest::Step => self.step()?,
                 NextRequest::Episode => self.begin()?,
@@ -256,11 +256,11 @@ impl<'a> Film<'a> {
 
     /// Requests the next state, and a picture of it if it will be shown.
     fn request_next(&mut self) -> Result<NextRequest, VideoError> {
-        self.pictured[1] = true;
+        self.picture_requested[1] = true;
         let next = if self.caption_text.ending.is_none() {
             let action = self.player.act().map_err(TestError::Numbers)?;
             self.single.request_step(action)?;
-            self.pictured[1] = (self.caption_text.step + 1).is_multiple_of(self.options.every);
+            self.picture_requested[1] = (self.caption_text.step + 1).is_multiple_of(self.options.every);
             NextRequest::Step
         } else if (self.episodes() as u64) < self.options.episodes {
             self.single.request_reset()?;
@@ -268,7 +268,7 @@ impl<'a> Film<'a> {
         } else {
             return Ok(NextRequest::Nothing);
         };
-        if self.pictured[1] {
+        if self.picture_requested[1] {
             self.request_picture()?;
         }
         Ok(next)
@@ -280,8 +280,8 @@ impl<'a> Film<'a> {
     }
 
     /// Receives the picture of the current state, if one was requested, and writes a frame.
-    fn expose(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
-        if !self.pictured[0] {
+    fn write_frame(&mut self, writer: &mut VideoWriter) -> Result<(), VideoError> {
+        if !self.picture_requested[0] {
             return Ok(());
         }
         let asked = Instant::now();
@@ -313,7 +313,7 @@ impl<'a> Film<'a> {
         let asked = Instant::now();
         self.single.stepped(&mut self.reply)?;
         self.footage.waiting += asked.elapsed();
-        self.pictured[0] = self.pictured[1];
+        self.picture_requested[0] = self.picture_requested[1];
         let Self { reply, caption_text, player, ended, .. } = self;
         player.observe(&reply.all().outcome(ended), None).map_err(TestError::Numbers)?;
         caption_text.step += 1;
@@ -334,11 +334,11 @@ impl<'a> Film<'a> {
             length: end.length,
             success: end.success,
         });
-        if !self.pictured[0] {
+        if !self.picture_requested[0] {
             // Request a picture of the final state even if it is not due after this step. No reset was requested
             // yet, so the server still has the state.
             self.request_picture()?;
-            self.pictured[0] = true;
+            self.picture_requested[0] = true;
         }
         Ok(())
     }
@@ -347,15 +347,15 @@ impl<'a> Film<'a> {
     fn begin(&mut self) -> Result<(), VideoError> {
         let asked = Instant::now();
         self.begun = self.single.begun(&mut self.reply.observations)?;
-        self.pictured[0] = true;
-        self.player.see(0, &self.reply.observations).map_err(TestError::Numbers)?;
+        self.picture_requested[0] = true;
+        self.player.replace_observation(0, &self.reply.observations).map_err(TestError::Numbers)?;
         self.footage.waiting += asked.elapsed();
-        self.announce();
+        self.reset_caption();
         Ok(())
     }
 
     /// Updates the caption for the new episode.
-    fn announce(&mut self) {
+    fn reset_caption(&mut self) {
         let number = self.episodes() + 1;
         let episodes = self.options.episodes;
         let trial = match self.state.config.settings.episodes_per_trial() {

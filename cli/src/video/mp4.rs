@@ -35,14 +35,14 @@ pub(super) struct Mp4Encoder {
     child: Child,
     /// Standard error of ffmpeg. It is a file and not a pipe, because a pipe would not be read while frames are
     /// written.
-    words: File,
+    stderr_file: File,
     size: (u32, u32),
     fps: f64,
 }
 
 impl Mp4Encoder {
     pub(super) fn new(path: &Path, size: (u32, u32), fps: f64) -> io::Result<Self> {
-        let words = tempfile::tempfile()?;
+        let stderr_file = tempfile::tempfile()?;
         let size_text = format!("{}x{}", size.0, size.1);
         let fps_text = fps.to_string();
         let child = Command::new(PROGRAM)
@@ -57,12 +57,12 @@ impl Mp4Encoder {
             .arg(path)
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
-            .stderr(words.try_clone()?)
+            .stderr(stderr_file.try_clone()?)
             // Ctrl-C is handled by this process, which then ends ffmpeg.
             .process_group(0)
             .spawn()
             .map_err(|error| io::Error::other(format!("`{PROGRAM}` cannot be started: {error}")))?;
-        Ok(Self { child, words, size, fps })
+        Ok(Self { child, stderr_file, size, fps })
     }
 
     /// Waits for the end of ffmpeg, and returns an error with its exit status and messages.
@@ -70,7 +70,7 @@ impl Mp4Encoder {
         drop(self.child.stdin.take());
         let status = self.child.wait().map_or_else(|error| error.to_string(), |status| status.to_string());
         let mut words = String::new();
-        let read = self.words.rewind().and_then(|()| self.words.read_to_string(&mut words));
+        let read = self.stderr_file.rewind().and_then(|()| self.stderr_file.read_to_string(&mut words));
         io::Error::other(match (read, words.trim()) {
             (Ok(_), words) if !words.is_empty() => format!("{PROGRAM} ended with {status}: {words}"),
             _ => format!("{PROGRAM} ended with {status}"),

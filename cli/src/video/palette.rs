@@ -21,7 +21,7 @@ pub(super) struct Palette {
     colours: Vec<PixelColour>,
     /// The palette index of each of the 2²⁴ colours, at the position red · 2¹⁶ + green · 2⁸ + blue; 0 for a colour that
     /// was not looked up yet. Most entries are never written, so the operating system gives them no memory.
-    met: Vec<u8>,
+    index_of_colour: Vec<u8>,
 }
 
 impl Palette {
@@ -34,8 +34,8 @@ impl Palette {
         }
         let mut all: Vec<(PixelColour, u32)> = counts.into_iter().collect();
         all.sort_unstable_by_key(|&(colour, count)| (Reverse(count), colour));
-        let colours = (1..).find_map(|apart| spread(&all, apart)).unwrap_or_default();
-        Self { colours, met: vec![UNCHANGED; 1 << 24] }
+        let colours = (1..).find_map(|apart| select_colours(&all, apart)).unwrap_or_default();
+        Self { colours, index_of_colour: vec![UNCHANGED; 1 << 24] }
     }
 
     /// Returns the red, green and blue value of each palette index.
@@ -50,10 +50,10 @@ impl Palette {
         indices.extend(frame.as_chunks().0.iter().map(|&colour| {
             let [red, green, blue] = colour.map(usize::from);
             let place = red << 16 | green << 8 | blue;
-            if self.met[place] == UNCHANGED {
-                self.met[place] = self.index(colour);
+            if self.index_of_colour[place] == UNCHANGED {
+                self.index_of_colour[place] = self.index(colour);
             }
-            self.met[place]
+            self.index_of_colour[place]
         }));
     }
 
@@ -77,7 +77,7 @@ impl Palette {
 /// distance from all selected colours is at least `apart`. The required distance shrinks with the fourth root of the
 /// number of pixels, so it is half as large for 16 pixels. Returns `None` if more than [`FIRST_FRAME_COLOURS`] are
 /// selected.
-fn spread(all: &[(PixelColour, u32)], apart: u64) -> Option<Vec<PixelColour>> {
+fn select_colours(all: &[(PixelColour, u32)], apart: u64) -> Option<Vec<PixelColour>> {
     let mut colours: Vec<PixelColour> = Vec::new();
     for &(colour, count) in all {
         let is_far =

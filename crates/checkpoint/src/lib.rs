@@ -21,7 +21,7 @@ use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 use perturb_files::checksum::WithChecksum;
-use perturb_files::{FileError, checksum, has_file, read_if_there, write_atomically};
+use perturb_files::{FileError, checksum, has_file, read_if_exists, write_atomically};
 use perturb_policy::{
     Inputs, Normalisers, ObservationNormaliser, Player, PlayerRole, PolicySpec, RewardNormaliser, Weights,
 };
@@ -395,7 +395,7 @@ impl CheckpointDocument {
             false => path.join("checkpoint"),
         };
         let json = directory.join(JSON);
-        let text = if has_file(&json)? { read_if_there(&json)? } else { None };
+        let text = if has_file(&json)? { read_if_exists(&json)? } else { None };
         let text = text.ok_or_else(|| CheckpointError::Missing { path: path.to_owned() })?;
         Ok((directory, Self::parse(&json, &text)?))
     }

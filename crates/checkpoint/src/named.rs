@@ -3,7 +3,7 @@
 
 use std::path::{Component, Path, PathBuf};
 
-use perturb_files::{has_file, list, look};
+use perturb_files::{has_file, list, metadata_if_exists};
 use perturb_protocol::names;
 
 use super::single_file::{SUFFIX, is_policy};
@@ -37,7 +37,7 @@ pub fn find(path: &Path) -> Result<Option<PathBuf>> {
 
 fn find_below(folder: &Path, path: &Path) -> Result<Option<PathBuf>> {
     let mut places = vec![path.to_owned(), path.join("training")];
-    if look(path)?.is_none() {
+    if metadata_if_exists(path)?.is_none() {
         let below = [Some(path), path.strip_prefix(FOLDER).ok()].into_iter().flatten().map(|rest| folder.join(rest));
         places.extend(below.flat_map(|place| [place.clone(), place.join("training")]));
     }

@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use perturb_files::{AnyError, read_if_there};
+use perturb_files::{AnyError, read_if_exists};
 use perturb_protocol::Version;
 use perturb_records::TrainedOn;
 use perturb_records::statistics::{Summary, mean};
@@ -155,7 +155,7 @@ fn read_runs(
 
 /// Reads the episodes in the order in which they ended. Returns an empty list if there is no file.
 fn read_monitor(path: &Path) -> Result<Vec<MonitorEpisode>, FolderError> {
-    let Some(content) = read_if_there(path)? else { return Ok(Vec::new()) };
+    let Some(content) = read_if_exists(path)? else { return Ok(Vec::new()) };
     let damaged = |error: AnyError| FolderError::Damaged { path: path.to_owned(), reason: error.to_string() };
     parse_monitor(&content).map_err(damaged)
 }

@@ -259,12 +259,12 @@ impl ExperimentFolder {
     ///
     /// # Errors
     /// [`FileError`] if a file cannot be written.
-    pub fn keep_plan(&self, plan: &Plan) -> files::Result<bool> {
-        let earlier = files::read_if_there(&self.plan_path())?;
+    pub fn store_plan(&self, plan: &Plan) -> files::Result<bool> {
+        let earlier = files::read_if_exists(&self.plan_path())?;
         let same = earlier.as_deref() == Some(plan.text.as_bytes());
         for (name, content) in plan.files() {
             let path = self.path.join(name);
-            if files::read_if_there(&path)?.as_deref() != Some(content) {
+            if files::read_if_exists(&path)?.as_deref() != Some(content) {
                 write_atomically(&path, content)?;
             }
         }
@@ -597,9 +597,9 @@ mod tests {
             let text = format!("environments = ['{environment}']\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']");
             Plan::parse("test", text).unwrap()
         };
-        assert!(!folder.keep_plan(&plan("One")).unwrap());
-        assert!(!folder.keep_plan(&plan("One")).unwrap());
-        assert!(folder.keep_plan(&plan("Two")).unwrap());
+        assert!(!folder.store_plan(&plan("One")).unwrap());
+        assert!(!folder.store_plan(&plan("One")).unwrap());
+        assert!(folder.store_plan(&plan("Two")).unwrap());
         assert_eq!(fs::read_to_string(folder.require_plan().unwrap()).unwrap(), plan("Two").text);
     }
 }

@@ -14,7 +14,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use perturb_files::{self as files, delete, read_if_there, write_atomically, write_json};
+use perturb_files::{self as files, delete, read_if_exists, write_atomically, write_json};
 use perturb_records::{Axis, Heatmap, HeatmapKind, HeatmapOptions, TrainedOn, heatmap_table};
 use perturb_settings::Method;
 use serde::{Deserialize, Serialize};
@@ -127,7 +127,7 @@ pub fn heatmap_kinds<'a>(
         if path.extension().is_none_or(|ending| ending != "json") {
             continue;
         }
-        let Some(record) = read_if_there(&path)?.and_then(|text| HeatmapRecord::parse(&text)) else { continue };
+        let Some(record) = read_if_exists(&path)?.and_then(|text| HeatmapRecord::parse(&text)) else { continue };
         if let Some(environment) = environments.get(record.cell.as_str()) {
             kinds.entry(environment).or_default().insert(record.options.kind());
         }
@@ -173,14 +173,14 @@ impl HeatmapPlace<'_> {
         cell: &Cell,
         kind: &HeatmapKind,
     ) -> Result<Result<StoredHeatmap, NoHeatmap>, FolderError> {
-        let record = read_if_there(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::parse(&text));
+        let record = read_if_exists(&path.with_added_extension("json"))?.and_then(|text| HeatmapRecord::parse(&text));
         let Some(record) = record.filter(|record| record.cell == cell.id && record.options.kind() == *kind) else {
             return Ok(Err(NoHeatmap::NotMade));
         };
         if Some(&record.result) != result_checksum(folder, cell)?.as_ref() {
             return Ok(Err(NoHeatmap::Outdated));
         }
-        let figures = read_if_there(&path.with_added_extension("csv"))?;
+        let figures = read_if_exists(&path.with_added_extension("csv"))?;
         let figures = figures.filter(|figures| checksum(figures) == record.figures);
         let heatmap = figures.and_then(|figures| record.blank(self.environment).with_points(&figures));
         Ok(heatmap.map_or(Err(NoHeatmap::NotMade), |heatmap| Ok(StoredHeatmap { record, heatmap })))
@@ -245,7 +245,7 @@ pub fn store_heatmap(
 
 /// Returns the checksum of a cell's `result.json`; `None` if there is no such file.
 fn result_checksum(folder: &ExperimentFolder, cell: &Cell) -> files::Result<Option<String>> {
-    Ok(read_if_there(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
+    Ok(read_if_exists(&folder.cell(&cell.id).path().join("result.json"))?.map(|content| checksum(&content)))
 }
 
 /// Returns the CRC-32C of `content` in hexadecimal.

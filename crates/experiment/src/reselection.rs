@@ -32,7 +32,7 @@ const SELECTION_SEED: u64 = 2;
 
 /// A bootstrap over the results of a plan that repeats all selections in each resample.
 pub struct SelectionBootstrap<'a> {
-    contests: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Candidates<'a>>,
+    candidates_by_selection: HashMap<(&'a str, Method, TrainedOn<'a>, Option<u32>), Candidates<'a>>,
     rule: Selection,
 }
 
@@ -40,11 +40,11 @@ pub struct SelectionBootstrap<'a> {
 #[derive(Default)]
 struct Candidates<'a> {
     seeds: Vec<u64>,
-    candidates: Vec<SelectableCell<'a>>,
+    candidates: Vec<CandidateConfiguration<'a>>,
 }
 
 /// A configuration that can be selected, with the selection tests of its cells.
-struct SelectableCell<'a> {
+struct CandidateConfiguration<'a> {
     configuration: &'a str,
     tests: Vec<SelectionTest>,
 }
@@ -69,7 +69,7 @@ impl<'a> SelectionBootstrap<'a> {
     /// Collects the selection tests of all finished cells.
     pub fn new(results: &'a Results<'a>) -> Self {
         let rule = results.plan.selection;
-        let mut contests = HashMap::new();
+        let mut candidates_by_selection = HashMap::new();
         for (cell, state) in results.plan.cells.iter().zip(&results.states) {
             let CellState::Done(result) = state else { continue };
             let name = match rule {
@@ -77,11 +77,12 @@ impl<'a> SelectionBootstrap<'a> {
                 Selection::Clean => SELECTION_TEST.into(), // only tuning cells have this test
             };
             if let Some(test) = result.results.get(&name) {
-                let contest: &mut Candidates<'a> = contests.entry(key(cell, rule, cell.run)).or_default();
+                let contest: &mut Candidates<'a> =
+                    candidates_by_selection.entry(key(cell, rule, cell.run)).or_default();
                 contest.add(cell, SelectionTest::new(cell, result, test));
             }
         }
-        Self { contests, rule }
+        Self { candidates_by_selection, rule }
     }
 
     /// Computes the numbers that `statistic` returns, each with its 95 % bootstrap interval from `resamples` resamples.
@@ -139,7 +140,7 @@ impl<'a> SelectionBootstrap<'a> {
                     let selected = selection.runs[&number].cell_trained_on(TrainedOn::Version(version));
                     let selected = selected.filter(|_| needs(version))?;
                     let key = key(selected.cell, self.rule, number);
-                    let contest = self.contests.get(&key)?;
+                    let contest = self.candidates_by_selection.get(&key)?;
                     let place = *places.entry(key).or_insert_with(|| {
                         contests.push(contest);
                         contests.len() - 1
@@ -168,13 +169,15 @@ impl<'a> Candidates<'a> {
         }
         match self.candidates.iter_mut().find(|known| known.configuration == cell.configuration) {
             Some(known) => known.tests.push(test),
-            None => self.candidates.push(SelectableCell { configuration: &cell.configuration, tests: vec![test] }),
+            None => {
+                self.candidates.push(CandidateConfiguration { configuration: &cell.configuration, tests: vec![test] })
+            }
         }
     }
 
     /// Repeats the selection with redrawn seeds and numbers of successes, and returns the winner. Breaks ties at
     /// random. Returns `None` if no candidate was tested with a drawn seed.
-    fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&SelectableCell<'a>> {
+    fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&CandidateConfiguration<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
         }
@@ -202,7 +205,7 @@ impl<'a> Candidates<'a> {
     }
 }
 
-impl SelectableCell<'_> {
+impl CandidateConfiguration<'_> {
     /// Returns the redrawn success rate, %, and the mean return, averaged over the tests with these `seeds`. Returns
     /// `None` if there is no such test.
     fn rank(&self, seeds: &[u64], uniform: &mut impl FnMut() -> f64) -> Option<(f64, f64)> {
@@ -232,7 +235,7 @@ impl DrawnPolicy<'_> {
     fn score_of(
         &self,
         metric: Metric,
-        winners: &[Option<&SelectableCell<'_>>],
+        winners: &[Option<&CandidateConfiguration<'_>>],
         uniform: &mut impl FnMut() -> f64,
     ) -> f64 {
         let others = self.selected.map(|selected| {

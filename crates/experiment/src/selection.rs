@@ -167,12 +167,12 @@ impl<'a> MethodResults<'a> {
     /// Counts a tuning cell. The first tuning cell of a training distribution also adds `runs` to the number of cells,
     /// because so many cells will be trained after the selection.
     fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
-        let is_papers = usize::from(cell.set.is_none());
-        self.cells += is_papers;
-        self.done += is_papers * usize::from(matches!(state, CellState::Done(_)));
+        let counts_as_cell = usize::from(cell.set.is_none());
+        self.cells += counts_as_cell;
+        self.done += counts_as_cell * usize::from(matches!(state, CellState::Done(_)));
         for run in 1..=runs {
             self.runs.entry(run).or_default().selected.entry(cell.trained_on()).or_insert_with(|| {
-                self.cells += is_papers;
+                self.cells += counts_as_cell;
                 None
             });
         }
@@ -180,11 +180,11 @@ impl<'a> MethodResults<'a> {
 
     /// Lets `cell` take part in the selection of its run. Must be called in the plan's order.
     fn consider(&mut self, cell: &'a Cell, state: &'a CellState) {
-        let is_papers = usize::from(cell.set.is_none());
+        let counts_as_cell = usize::from(cell.set.is_none());
         let run = self.runs.entry(cell.run).or_default();
         let best = run.selected.entry(cell.trained_on()).or_default();
         let CellState::Done(result) = state else { return };
-        self.done += is_papers;
+        self.done += counts_as_cell;
         let candidate = Selected { cell, result };
         let best_rank = best.and_then(|best| best.cell()).map(|best| best.rank());
         if best_rank.is_none_or(|best_rank| candidate.rank() > best_rank) {

@@ -18,7 +18,7 @@ mod lock;
 mod plain;
 
 pub use self::lock::{Lock, is_locked};
-pub use self::plain::{Stamp, leads_out, read_plain, read_plain_text};
+pub use self::plain::{Stamp, escapes_root, read_plain, read_plain_text};
 pub use perturb_system::open_plain;
 
 /// The prefix of the names of temporary files, which are renamed after they are complete.
@@ -65,7 +65,7 @@ pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> F
 /// # Errors
 /// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
-    read_if_there(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
+    read_if_exists(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
 }
 
 /// Reads the text of a TOML file.
@@ -81,7 +81,7 @@ pub fn read_toml(path: &Path) -> Result<String> {
 ///
 /// # Errors
 /// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
-pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
+pub fn read_if_exists(path: &Path) -> Result<Option<Vec<u8>>> {
     read_plain(path, plain::MAX_BYTES)
 }
 
@@ -90,7 +90,7 @@ pub fn read_if_there(path: &Path) -> Result<Option<Vec<u8>>> {
 ///
 /// # Errors
 /// An error of the operating system.
-pub fn look(path: &Path) -> Result<Option<fs::Metadata>> {
+pub fn metadata_if_exists(path: &Path) -> Result<Option<fs::Metadata>> {
     match fs::metadata(path).map_err(io("look for", path)) {
         Ok(metadata) => Ok(Some(metadata)),
         Err(error) if error.is_fault() => Err(error),
@@ -101,9 +101,9 @@ pub fn look(path: &Path) -> Result<Option<fs::Metadata>> {
 /// Returns whether `path` is a regular file.
 ///
 /// # Errors
-/// The errors of [`look`].
+/// The errors of [`metadata_if_exists`].
 pub fn has_file(path: &Path) -> Result<bool> {
-    Ok(look(path)?.is_some_and(|metadata| metadata.is_file()))
+    Ok(metadata_if_exists(path)?.is_some_and(|metadata| metadata.is_file()))
 }
 
 /// Creates a folder and all its missing parents.
@@ -324,8 +324,8 @@ mod tests {
     fn what_is_not_there_is_no_error_where_that_is_asked() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("nothing");
-        assert_eq!(read_if_there(&path).unwrap(), None);
-        assert!(look(&path).unwrap().is_none() && !has_file(&path.join("file")).unwrap());
+        assert_eq!(read_if_exists(&path).unwrap(), None);
+        assert!(metadata_if_exists(&path).unwrap().is_none() && !has_file(&path.join("file")).unwrap());
         assert!(!has_file(directory.path()).unwrap(), "a folder");
         assert!(list(&path).unwrap().is_empty());
         delete(&path).unwrap();

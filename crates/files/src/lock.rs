@@ -6,7 +6,7 @@ use std::path::Path;
 use std::time::Duration;
 
 use perturb_system::plain::nonblocking_flag;
-use perturb_system::support::is_taken;
+use perturb_system::support::is_acquired;
 
 use super::{Result, io};
 
@@ -43,13 +43,13 @@ impl Lock {
         options.create(true).truncate(false).read(true).write(true).custom_flags(nonblocking_flag());
         let file = options.open(&path).map_err(io("open", &path))?;
         for _ in 0..MAX_LOCK_TRIES {
-            let exclusive = is_taken(file.try_lock(), &path).map_err(io("lock", &path))?;
+            let exclusive = is_acquired(file.try_lock(), &path).map_err(io("lock", &path))?;
             if exclusive != Some(false) {
                 return Ok(Some(Self(file)));
             }
             // A process that holds the lock has it exclusively, while a test uses a shared lock. If this process can
             // get a shared lock, no process holds the lock, and another process is only testing it.
-            match is_taken(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
+            match is_acquired(file.try_lock_shared(), &path).map_err(io("lock", &path))? {
                 Some(true) => file.unlock().map_err(io("unlock", &path))?,
                 _ => return Ok(None),
             }

@@ -74,7 +74,7 @@ pub fn read_plain_text(path: &Path, most: u64) -> Result<String> {
 
 /// Returns whether the path `name` in `folder` passes a symbolic link that leads out of `root`, or to a hidden file or
 /// folder in `root`. `folder` must be inside of `root` and must not contain symbolic links.
-pub fn leads_out(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
+pub fn escapes_root(root: &Path, folder: &Path, name: impl AsRef<Path>) -> bool {
     let mut path = folder.to_owned();
     name.as_ref().components().any(|component| {
         path.push(component);
@@ -105,7 +105,7 @@ mod tests {
         assert!(Command::new("mkfifo").arg(&pipe).status().unwrap().success());
         let error = read_plain(&pipe, MAX_BYTES).unwrap_err();
         assert!(error.to_string().contains("it is a pipe") && !error.is_fault(), "{error}");
-        assert!(super::super::read_if_there(&pipe).is_err());
+        assert!(super::super::read_if_exists(&pipe).is_err());
     }
 
     #[test]
@@ -134,7 +134,7 @@ mod tests {
             symlink(to, run.join(name)).unwrap();
         }
         let out =
-            ["a", "b", "c", "d", "e/out", "file", "inner/file", "missing"].map(|name| leads_out(&root, &run, name));
+            ["a", "b", "c", "d", "e/out", "file", "inner/file", "missing"].map(|name| escapes_root(&root, &run, name));
         assert_eq!(out, [true, true, false, false, true, false, false, false]);
     }
 }

@@ -128,7 +128,7 @@ impl Simulation {
     /// The values of a field of the model, for editing. Call [`set_const`](Self::set_const) after editing masses,
     /// inertias, armatures or gears.
     pub fn field_mut(&mut self, field: ModelField) -> &mut [f64] {
-        let (start, length) = self.model.place(field);
+        let (start, length) = self.model.pointer_and_length(field);
         self.array_mut(start, length)
     }
 
@@ -285,7 +285,7 @@ impl Simulation {
 
     /// Sets [`DataField::BodyExternalForces`] to 0, its value after [`reset`](Self::reset).
     pub fn clear_external_forces(&mut self) {
-        let (start, length) = DataField::BodyExternalForces.place(self.raw(), self.model.raw());
+        let (start, length) = DataField::BodyExternalForces.pointer_and_length(self.raw(), self.model.raw());
         self.array_mut(start, length).fill(0.0);
     }
 
@@ -437,7 +437,7 @@ impl Simulation {
 
     /// The values of an array that MuJoCo computed.
     pub fn reading(&self, reading: DataField) -> &[f64] {
-        let (start, length) = reading.place(self.raw(), self.model.raw());
+        let (start, length) = reading.pointer_and_length(self.raw(), self.model.raw());
         self.array(start, length)
     }
 

@@ -14,7 +14,7 @@ macro_rules! model_arrays {
 
         impl $name {
             /// A pointer to the first element of the array in this model, and the number of elements.
-            pub(crate) fn place(self, m: &sys::mjModel) -> (*mut $type, usize) {
+            pub(crate) fn pointer_and_length(self, m: &sys::mjModel) -> (*mut $type, usize) {
                 match self {
                     $(Self::$field => {
                         let length: fn(&sys::mjModel) -> i32 = $length;
@@ -50,7 +50,7 @@ macro_rules! float_fields {
             ///
             /// # Safety
             /// `raw` must point to a valid model that is not written during the call.
-            pub(crate) unsafe fn place(self, raw: *mut sys::mjModel) -> (*mut f64, usize) {
+            pub(crate) unsafe fn pointer_and_length(self, raw: *mut sys::mjModel) -> (*mut f64, usize) {
                 // SAFETY: the caller passes a valid model.
                 let m = unsafe { &*raw };
                 match self {
@@ -284,7 +284,7 @@ macro_rules! data_arrays {
         impl DataField {
             /// A pointer to the first element of the array in the data `d` of the model `m`, and the number of
             /// elements.
-            pub(crate) fn place(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {
+            pub(crate) fn pointer_and_length(self, d: &sys::mjData, m: &sys::mjModel) -> (*mut f64, usize) {
                 match self {
                     $(Self::$field => {
                         let length: fn(&sys::mjModel) -> i32 = $length;

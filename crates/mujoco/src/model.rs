@@ -305,30 +305,30 @@ impl Model {
 
     /// The values of a floating-point array or option.
     pub fn field(&self, field: ModelField) -> &[f64] {
-        let (start, length) = self.place(field);
+        let (start, length) = self.pointer_and_length(field);
         self.array(start, length)
     }
 
     /// The total number of elements in `fields`.
     pub fn n_fields(&self, fields: &[ModelField]) -> usize {
-        fields.iter().map(|&field| self.place(field).1).sum()
+        fields.iter().map(|&field| self.pointer_and_length(field).1).sum()
     }
 
     /// A pointer to the first element of a field, and the number of its elements.
-    pub(crate) fn place(&self, field: ModelField) -> (*mut f64, usize) {
+    pub(crate) fn pointer_and_length(&self, field: ModelField) -> (*mut f64, usize) {
         // SAFETY: the pointer is a valid model for the lifetime of `self`, and is not written through a `&Model`.
-        unsafe { field.place(self.as_ptr()) }
+        unsafe { field.pointer_and_length(self.as_ptr()) }
     }
 
     /// The values of an integer array: types of elements, or indices of other elements.
     pub fn index_array(&self, index: Index) -> &[i32] {
-        let (start, length) = index.place(self.raw());
+        let (start, length) = index.pointer_and_length(self.raw());
         self.array(start, length)
     }
 
     /// The values of an array of flags.
     pub fn flags(&self, flags: Flags) -> &[u8] {
-        let (start, length) = flags.place(self.raw());
+        let (start, length) = flags.pointer_and_length(self.raw());
         self.array(start, length)
     }
 
@@ -403,7 +403,7 @@ impl Model {
 
     /// Pointers to the arrays that [`Simulation::constants`](crate::Simulation::constants) copies, and their lengths.
     pub(crate) fn constants(&self) -> [(*mut f64, usize); 9] {
-        CONSTANTS.map(|field| self.place(field))
+        CONSTANTS.map(|field| self.pointer_and_length(field))
     }
 
     pub(crate) fn raw(&self) -> &sys::mjModel {

@@ -88,7 +88,7 @@ impl ModelRenderer {
                 scene_geoms(renderer.simulation.model()),
             )
         })?;
-        renderer.make_room(size)?;
+        renderer.replace_context(size)?;
         Ok(renderer)
     }
 
@@ -106,7 +106,7 @@ impl ModelRenderer {
     pub fn draw(&mut self, view: CameraView, (width, height): (u16, u16)) -> Result<Vec<u8>, Error> {
         let (most_wide, most_high) = self.size;
         if width > most_wide || height > most_high {
-            self.make_room((width.max(most_wide), height.max(most_high)))?;
+            self.replace_context((width.max(most_wide), height.max(most_high)))?;
         }
         let mut camera = match view {
             CameraView::Free(Camera { look_at, distance, azimuth, elevation }) => sys::mjvCamera {
@@ -166,7 +166,7 @@ impl ModelRenderer {
     }
 
     /// Replaces the drawing context by one whose picture buffer has this width and height in pixels.
-    fn make_room(&mut self, size: (u16, u16)) -> Result<(), Error> {
+    fn replace_context(&mut self, size: (u16, u16)) -> Result<(), Error> {
         let _drawing = self.enter()?;
         // SAFETY: `gl` is current. The context is an empty default or was made in `gl`, and freeing makes it an empty
         // default again. Making a context writes the buffer's size into the model, of which `&mut self` excludes other

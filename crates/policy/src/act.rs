@@ -127,7 +127,7 @@ impl Actor {
     pub fn keep_activations(&mut self, n_steps: usize) {
         match &mut self.network {
             Network::FeedForward(network) if self.max_batch.saturating_mul(n_steps.saturating_add(1)) <= BLOCK => {
-                network.keep(&self.spec);
+                network.enable_cache(&self.spec);
             }
             _ => {}
         }

@@ -81,9 +81,9 @@ impl FeedForward {
         FeedForward { observation_size: spec.observation_size, networks, activations, max_cached: 0, cached: None }
     }
 
-    /// Turns on the cache of activations, for [`FeedForward::exchange`]. It holds up to [`BLOCK`] rows. Each
+    /// Turns on the cache of activations, for [`FeedForward::swap_networks`]. It holds up to [`BLOCK`] rows. Each
     /// observation takes one row, even if only its value is computed.
-    pub(crate) fn keep(&mut self, spec: &PolicySpec) {
+    pub(crate) fn enable_cache(&mut self, spec: &PolicySpec) {
         self.max_cached = BLOCK;
         self.activations = Activations::new(spec, &self.networks, BLOCK);
     }
@@ -96,7 +96,7 @@ impl FeedForward {
 
     /// Swaps the networks for `networks`. If any rows are cached, also swaps the activations for `activations`, which
     /// must have [`BLOCK`] rows. Returns the number of cached rows. Weights must be loaded before acting again.
-    pub(crate) fn exchange(&mut self, networks: &mut Networks, activations: &mut Activations) -> usize {
+    pub(crate) fn swap_networks(&mut self, networks: &mut Networks, activations: &mut Activations) -> usize {
         swap(&mut self.networks, networks);
         let cached = self.cached.take().unwrap_or(0);
         if cached > 0 {
@@ -152,7 +152,7 @@ mod tests {
         let spec = PolicySpec::feed_forward(O, ActionKind::Discrete { n: 2 });
         let mut acting = FeedForward::new(&spec, n);
         if keeps {
-            acting.keep(&spec);
+            acting.enable_cache(&spec);
         }
         let weights = initial_weights(&spec, &mut stream(1, Purpose::Weights));
         let weights: Vec<f32> = weights.iter().flat_map(|array| array.data.clone()).collect();
@@ -163,12 +163,12 @@ mod tests {
         }
         let mut networks = Networks::new(&spec);
         let mut activations = Activations::new(&spec, &networks, BLOCK);
-        let cached = acting.exchange(&mut networks, &mut activations);
+        let cached = acting.swap_networks(&mut networks, &mut activations);
         for row in 0..BLOCK {
             let observation = activations.observations.row(row)[0];
             assert_eq!(row < cached, observation == 1.0, "row {row} of {cached} begins with {observation}");
         }
-        assert_eq!(acting.exchange(&mut networks, &mut activations), 0, "given once");
+        assert_eq!(acting.swap_networks(&mut networks, &mut activations), 0, "given once");
         cached
     }
 

@@ -114,7 +114,7 @@ impl Differentiator {
     pub fn load_from(&mut self, actor: &mut Actor) -> bool {
         self.make_parts(1);
         let Some((acted, log_std)) = actor.give_networks(&self.spec) else { return false };
-        self.computed = acted.exchange(&mut self.networks, &mut self.parts[0].block.activations);
+        self.computed = acted.swap_networks(&mut self.networks, &mut self.parts[0].block.activations);
         self.gaussian.load(log_std);
         true
     }

@@ -43,7 +43,7 @@ impl Layer {
     /// rows of `to`. Products are added in order of i.
     #[inline(always)]
     pub(crate) fn apply<S: Simd>(&self, simd: S, from: &Rows, rows: Range<usize>, to: &mut Rows) {
-        self.matrix.factor().apply_here(simd, from, rows, Some(&self.biases), to);
+        self.matrix.factor().apply_inline(simd, from, rows, Some(&self.biases), to);
     }
 }
 

@@ -295,7 +295,7 @@ impl Player {
     ///
     /// # Errors
     /// [`Error::Length`](crate::Error::Length) if the observation has the wrong length.
-    pub fn see(&mut self, slot: usize, observation: &[f32]) -> Result<()> {
+    pub fn replace_observation(&mut self, slot: usize, observation: &[f32]) -> Result<()> {
         check_length("observation [O]", observation.len(), self.observation_size)?;
         let row = &mut self.observations[slot * self.observation_size..][..self.observation_size];
         row.copy_from_slice(observation);

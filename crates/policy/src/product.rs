@@ -90,7 +90,7 @@ impl<'a> Factor<'a> {
     /// Computes the same product as [`Factor::apply`], inlined into its caller. Most rows are computed in blocks of
     /// eight or of four to seven; the last one to three rows are computed singly.
     #[inline(always)]
-    pub(crate) fn apply_here<S: Simd>(
+    pub(crate) fn apply_inline<S: Simd>(
         self,
         simd: S,
         from: &Rows,
@@ -256,7 +256,7 @@ impl Kernel for Apply<'_> {
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
         let Apply { factor, from, rows, start, to } = self;
-        factor.apply_here(simd, from, rows, start, to);
+        factor.apply_inline(simd, from, rows, start, to);
     }
 }
 

@@ -169,7 +169,7 @@ impl Connection {
             )
         };
         let channel = channel.map_err(transport)?;
-        takes_sessions(address, &channel).await?;
+        check_health(address, &channel).await?;
         let health = HealthClient::new(channel.clone());
         let client = PerturbClient::with_interceptor(channel, token)
             .max_decoding_message_size(MAX_MESSAGE_BYTES)
@@ -268,7 +268,7 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
         return Ok(one());
     }
     let fail = |reason| ClientError::Connect { address: address.clone(), reason };
-    let found: Vec<SocketAddr> = timeout(CONNECT_TIMEOUT, look_up(host, *port))
+    let found: Vec<SocketAddr> = timeout(CONNECT_TIMEOUT, resolve_in_thread(host, *port))
         .await
         .map_err(|_| fail(format!("its name was not resolved within {} s", CONNECT_TIMEOUT.as_secs())))?
         .map_err(|error| fail(format!("its name cannot be resolved: {error}")))?;
@@ -278,7 +278,7 @@ pub async fn resolve(address: &Address) -> Result<ResolvedAddresses, ClientError
 
 /// Resolves a host name in a new thread, so that a resolver that hangs blocks nothing else. Returns an error if no
 /// thread can be started; tokio's own resolver would panic.
-async fn look_up(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
+async fn resolve_in_thread(host: &str, port: u16) -> io::Result<Vec<SocketAddr>> {
     let name = host.to_owned();
     let (sender, found) = tokio::sync::oneshot::channel();
     let resolve = move || {
@@ -332,7 +332,7 @@ pub async fn connect_any(addresses: &[Address], timeouts: Timeouts) -> Result<Co
 /// # Errors
 /// [`ClientError::Connect`] with the reason for each machine, [`ClientError::NotPerturb`], [`ClientError::Unsafe`].
 pub async fn connect(address: &Address, timeouts: Timeouts) -> Result<Connection, ClientError> {
-    let machines = resolve(address).await?.into_order(own_turn());
+    let machines = resolve(address).await?.into_order(rotation());
     connect_any(&machines, timeouts).await.map_err(|errors| match ClientError::from_all(errors) {
         ClientError::NoneConnects { reasons } => ClientError::Connect { address: address.clone(), reason: reasons },
         error => error,
@@ -341,7 +341,7 @@ pub async fn connect(address: &Address, timeouts: Timeouts) -> Result<Connection
 
 /// Returns a number for [`ResolvedAddresses::into_order`] that spreads processes over machines. It is a hash of the
 /// process id and the host name: processes on one machine differ in the id, containers in the host name.
-fn own_turn() -> usize {
+fn rotation() -> usize {
     let mut hasher = DefaultHasher::new(); // unlike `RandomState`, it has the same key in every process
     std::fs::read("/proc/sys/kernel/hostname").unwrap_or_default().hash(&mut hasher);
     std::process::id().hash(&mut hasher);
@@ -350,7 +350,7 @@ fn own_turn() -> usize {
 
 /// Checks by a health request that a server answers and accepts sessions. An accepted connection alone proves nothing:
 /// a stopped or overloaded machine may accept connections and never answer.
-async fn takes_sessions(address: &Address, channel: &Channel) -> Result<(), ClientError> {
+async fn check_health(address: &Address, channel: &Channel) -> Result<(), ClientError> {
     let refuse = |reason| ClientError::Connect { address: address.clone(), reason };
     let request = HealthCheckRequest { service: SERVICE.into() };
     let answer = timeout(CONNECT_TIMEOUT, HealthClient::new(channel.clone()).check(request)).await.map_err(|_| {

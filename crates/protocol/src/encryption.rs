@@ -107,7 +107,7 @@ impl Service<Uri> for Connector {
             let tcp = TcpStream::connect((host.as_str(), port)).await?;
             tcp.set_nodelay(true)?;
             let stream = TlsConnector::from(config).connect(name, tcp).await;
-            let reason = stream.as_ref().err().and_then(|error| words(error, &host));
+            let reason = stream.as_ref().err().and_then(|error| describe_failure(error, &host));
             *failure.lock().unwrap_or_else(PoisonError::into_inner) = reason;
             stream.map(|stream| TokioIo::new(AlertRecordingStream { stream, shows_certificate, failure })).map_err(
                 |error| match error.kind() {
@@ -123,7 +123,7 @@ impl Service<Uri> for Connector {
 
 /// Describes why the server is not trusted. Returns `None` for errors of the transport, such as corrupted bytes, after
 /// which another attempt may succeed.
-fn words(error: &io::Error, host: &str) -> Option<String> {
+fn describe_failure(error: &io::Error, host: &str) -> Option<String> {
     use CertificateError as Bad;
     let error = error.get_ref()?.downcast_ref::<Error>()?;
     Some(match error {

@@ -95,8 +95,9 @@ impl Region {
     /// counts as its default value. If the physics can change within an episode, the values before and after the change
     /// are compared separately.
     pub fn is_within<'a>(&self, others: impl IntoIterator<Item = &'a Self>) -> bool {
-        let is_in =
-            |own: &ParameterBox, other: &ParameterBox| pairs(own, other, Distribution::is_within, default_value);
+        let is_in = |own: &ParameterBox, other: &ParameterBox| {
+            all_parameters(own, other, Distribution::is_within, default_value)
+        };
         let others: Vec<ParameterBox> = others.into_iter().flat_map(Self::physics).collect();
         self.physics().iter().all(|own| others.iter().any(|other| is_in(own, other)))
     }
@@ -106,7 +107,7 @@ impl Region {
     /// region with any disturbances.
     pub fn overlaps(&self, other: &Self) -> bool {
         let others = other.physics();
-        let overlap = |own, other| pairs(own, other, Distribution::overlaps, |_| None);
+        let overlap = |own, other| all_parameters(own, other, Distribution::overlaps, |_| None);
         self.physics().iter().any(|own| others.iter().any(|other| overlap(own, other)))
     }
 }
@@ -114,7 +115,7 @@ impl Region {
 /// Compares two boxes: whether `holds` is true for every parameter, given the parameter's set of values in each box.
 /// Returns false if a parameter that is not a disturbance is in only one box. If a disturbance is in only one box,
 /// `lacking` returns its value in the other box, or `None` to ignore the disturbance.
-fn pairs(
+fn all_parameters(
     one: &ParameterBox,
     other: &ParameterBox,
     holds: fn(&Distribution, &Distribution) -> bool,

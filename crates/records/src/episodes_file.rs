@@ -7,7 +7,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use perturb_files::{AnyError, read_if_there, write_atomically};
+use perturb_files::{AnyError, read_if_exists, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use crate::parquet_file::{ColumnValues, NamedColumn, ParquetFile, RowGroup, encode};
@@ -44,8 +44,8 @@ impl StudyEpisodes {
     ///
     /// # Errors
     /// [`RecordsError`] if the file cannot be read, or has another format.
-    pub fn read_if_there(path: &Path) -> Result<Option<Self>, RecordsError> {
-        let Some(content) = read_if_there(path)? else { return Ok(None) };
+    pub fn read_if_exists(path: &Path) -> Result<Option<Self>, RecordsError> {
+        let Some(content) = read_if_exists(path)? else { return Ok(None) };
         if ParquetFile::is_other(&content) {
             return Err(RecordsError::Other { path: path.to_owned() });
         }
@@ -176,7 +176,7 @@ fn without_applied(mut records: Records) -> Records {
 }
 
 fn episodes(about: &RecordsMetadata, group: &RowGroup<'_>) -> Result<Vec<EpisodeRecord>, AnyError> {
-    let place = |name: &str| group.place(name).ok_or_else(|| format!("it has no column {name}"));
+    let place = |name: &str| group.column_index(name).ok_or_else(|| format!("it has no column {name}"));
     let mut sets = group.texts(place("set")?)?;
     let seeds = group.unsigned_64(place("seed")?)?;
     let environments = group.unsigned_32(place("environment_index")?)?;

@@ -23,10 +23,10 @@ fn study() -> (StudyEpisodes, [Records; 2]) {
 fn episodes_read_back_without_applied_parameters() {
     let directory = tempfile::tempdir().unwrap();
     let path = directory.path().join("study.parquet");
-    assert_eq!(StudyEpisodes::read_if_there(&path).unwrap(), None);
+    assert_eq!(StudyEpisodes::read_if_exists(&path).unwrap(), None);
     let (study, [one, two]) = study();
     study.write(&path).unwrap();
-    let read = StudyEpisodes::read_if_there(&path).unwrap().unwrap();
+    let read = StudyEpisodes::read_if_exists(&path).unwrap().unwrap();
     assert_eq!(read, study);
     assert_eq!(read.policies(), 2);
     for (cell, records) in [("a", one), ("b", two)] {

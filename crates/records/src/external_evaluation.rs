@@ -14,7 +14,7 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use perturb_files::checksum::WithChecksum;
-use perturb_files::{self as files, FileError, checksum, read_if_there};
+use perturb_files::{self as files, FileError, checksum, read_if_exists};
 use perturb_protocol::Version;
 use perturb_settings::{Method, Observe, Preset, ValueError};
 use serde::{Deserialize, Serialize};
@@ -232,7 +232,7 @@ impl ExternalEvaluation {
 
     fn read_once(path: &Path) -> Result<Self> {
         let json = path.join(ASSESSMENT);
-        let Some(text) = read_if_there(&json)? else {
+        let Some(text) = read_if_exists(&json)? else {
             return Err(ExternalEvaluationError::Missing { path: path.to_owned() });
         };
         let broken = |reason: String| ExternalEvaluationError::Damaged { path: json.clone(), reason };
@@ -316,7 +316,7 @@ impl ExternalEvaluation {
 /// Returns the names of the records files that the document `json` lists. Returns an empty set if the document is missing
 /// or cannot be parsed.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
-    let text = read_if_there(json)?.unwrap_or_default();
+    let text = read_if_exists(json)?.unwrap_or_default();
     let mut value = serde_json::from_slice(&text).unwrap_or_default();
     // Ignores a wrong checksum, because only the names of the files are needed.
     let _ = checksum::open(&mut value);

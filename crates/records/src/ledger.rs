@@ -25,10 +25,10 @@ pub struct Ledgers {
     /// The draws of parameters, by environment.
     drawn: Vec<Drawn>,
     /// The state of the environments with the same session, seed and environment index.
-    at: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
+    by_address: BTreeMap<(SessionId, u64, u32), EnvironmentAddress>,
     refused: Vec<Refused>,
     /// The end of each server process; `None` if it is unknown.
-    over: Vec<Option<Moment>>,
+    process_ends: Vec<Option<Moment>>,
     /// The index of the first contradictory line, and a description of the contradiction.
     defect: Option<(u64, &'static str)>,
 }
@@ -179,19 +179,19 @@ impl Ledgers {
             self.defect = Some((n, "does not say that a server began"));
             return;
         }
-        let beginning = self.over.len().saturating_sub(1);
+        let beginning = self.process_ends.len().saturating_sub(1);
         let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
                 // A server process started. The process that wrote to the same ledger before must have ended by now.
                 if n > 0
-                    && let Some(over) = self.over.last_mut()
+                    && let Some(over) = self.process_ends.last_mut()
                 {
                     over.get_or_insert(at);
                 }
-                self.over.push(None);
+                self.process_ends.push(None);
             }
-            LedgerEvent::Ended => self.over.last_mut().into_iter().for_each(|over| *over = Some(at)),
+            LedgerEvent::Ended => self.process_ends.last_mut().into_iter().for_each(|over| *over = Some(at)),
             LedgerEvent::Refused { who, region, reason } => {
                 self.refused.push(Refused { line: line(who), region, reason })
             }
@@ -209,7 +209,7 @@ impl Ledgers {
         }
         for DrawEnd { seed, index, count, episode } in ends {
             for index in (0..count).map(|offset| index.saturating_add(offset)) {
-                self.end_one((line.session, seed, index), (episode, line.at));
+                self.record_end((line.session, seed, index), (episode, line.at));
             }
         }
         let (line, regions) = (Arc::new(line), regions.into_iter().map(Arc::new).collect::<Vec<_>>());
@@ -219,7 +219,7 @@ impl Ledgers {
                 return;
             };
             for index in (0..count).map(|offset| index.saturating_add(offset)) {
-                self.at.entry((line.session, seed, index)).or_default().open.push(self.drawn.len());
+                self.by_address.entry((line.session, seed, index)).or_default().open.push(self.drawn.len());
                 let (line, region) = (Arc::clone(&line), Arc::clone(region));
                 self.drawn.push(Drawn { line, seed, index, first, last: LastDraw::Unknown, ended: None, region });
             }
@@ -228,8 +228,8 @@ impl Ledgers {
 
     /// Records that an environment stopped drawing parameters. `end` has the environment's last episode and the time.
     /// The episode is `None` if nothing was drawn.
-    fn end_one(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
-        let address = self.at.entry(address).or_default();
+    fn record_end(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
+        let address = self.by_address.entry(address).or_default();
         address.ends.push(end);
         // If no environment is in use, `end` corrects the previous ends: the environments that ended last had drawn more
         // episodes.
@@ -287,7 +287,7 @@ impl Ledgers {
         }
         // If the end of an environment's draws is not recorded, the training may have lasted until its server process
         // ended.
-        let end = |drawn: &&Drawn| drawn.ended.or(self.over.get(drawn.line.session.0).copied().flatten());
+        let end = |drawn: &&Drawn| drawn.ended.or(self.process_ends.get(drawn.line.session.0).copied().flatten());
         let ends: Vec<Option<Moment>> = own.iter().map(end).collect();
         let is_by_owner = |line: &LedgerLine| {
             line.who.environment == environment.name
@@ -297,7 +297,7 @@ impl Ledgers {
         // Finds draws from the test sets that were made with the training's tokens before the training ended.
         for test in &records.about.tests {
             let set = &test.set.name;
-            let others = tested(environment, test, &claimed);
+            let others = test_regions(environment, test, &claimed);
             let overlaps = |region: &Region| others.iter().any(|other| other.overlaps(region));
             let mut reported: Option<Moment> = None;
             for drawn in self.drawn.iter().filter(|drawn| drawn.last != LastDraw::None && is_by_owner(&drawn.line)) {
@@ -335,7 +335,7 @@ impl Ledgers {
 
 /// Returns the parameter region of each context of a test. Omits regions that lie inside `claimed`, the region of the
 /// training.
-fn tested(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
+fn test_regions(environment: &proto::Environment, test: &RecordedTest, claimed: &Region) -> Vec<Region> {
     let of = |context| Region::from_version(environment, test.set.version, &test.set.parameters(context));
     test.set.listed().iter().map(of).filter(|region| !region.is_within([claimed])).collect()
 }

@@ -82,7 +82,7 @@ impl ColumnValues<'_> {
     }
 
     /// Returns the value in `row` as text, or an empty text if it is missing.
-    pub(crate) fn shown(&self, row: usize) -> String {
+    pub(crate) fn value_text(&self, row: usize) -> String {
         fn optional<T: ToString>(value: Option<T>) -> String {
             value.map_or_else(String::new, |value| value.to_string())
         }
@@ -259,7 +259,7 @@ impl RowGroup<'_> {
     }
 
     /// Returns the index of the column called `name`, or `None` if there is none.
-    pub(crate) fn place(&self, name: &str) -> Option<usize> {
+    pub(crate) fn column_index(&self, name: &str) -> Option<usize> {
         self.group.metadata().columns().iter().position(|column| column.column_descr().name() == name)
     }
 

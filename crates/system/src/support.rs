@@ -56,7 +56,7 @@ impl Operation {
 ///
 /// # Errors
 /// The operating system's error.
-pub fn is_taken(lock: std::result::Result<(), TryLockError>, path: &Path) -> Result<Option<bool>> {
+pub fn is_acquired(lock: std::result::Result<(), TryLockError>, path: &Path) -> Result<Option<bool>> {
     let taken = match lock {
         Ok(()) => Ok(true),
         Err(TryLockError::WouldBlock) => Ok(false),
@@ -91,9 +91,9 @@ mod tests {
     #[test]
     fn a_file_system_without_locks_is_told_from_a_taken_lock() {
         let refused = |code| Err(TryLockError::Error(Error::from_raw_os_error(code)));
-        assert_eq!(is_taken(refused(37), Path::new("lock")).unwrap(), None);
-        assert!(is_taken(refused(5), Path::new("lock")).is_err());
-        let taken = [Ok(()), Err(TryLockError::WouldBlock)].map(|lock| is_taken(lock, Path::new("lock")).unwrap());
+        assert_eq!(is_acquired(refused(37), Path::new("lock")).unwrap(), None);
+        assert!(is_acquired(refused(5), Path::new("lock")).is_err());
+        let taken = [Ok(()), Err(TryLockError::WouldBlock)].map(|lock| is_acquired(lock, Path::new("lock")).unwrap());
         assert_eq!(taken, [Some(true), Some(false)]);
     }
 

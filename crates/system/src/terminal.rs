@@ -6,12 +6,12 @@ use std::borrow::Cow;
 /// text. A terminal would interpret such characters: they can colour, move, delete and paste text. In a log, a newline
 /// could forge an entry.
 pub fn escape_terminal(text: &str) -> Cow<'_, str> {
-    if !text.chars().any(is_obeyed) {
+    if !text.chars().any(is_interpreted) {
         return Cow::Borrowed(text);
     }
     let mut shown = String::with_capacity(text.len());
     for character in text.chars() {
-        match is_obeyed(character) {
+        match is_interpreted(character) {
             true => shown.extend(character.escape_default()),
             false => shown.push(character),
         }
@@ -20,7 +20,7 @@ pub fn escape_terminal(text: &str) -> Cow<'_, str> {
 }
 
 /// Whether terminals or text viewers interpret a character instead of showing it.
-fn is_obeyed(character: char) -> bool {
+fn is_interpreted(character: char) -> bool {
     character.is_control()
         || matches!(character, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
 }

@@ -173,6 +173,6 @@ impl<'a> Replay<'a> {
             session.reset_one(slot, &mut observation)?;
         }
         player.begin_trial(slot, episode.seed, trial);
-        Ok(player.see(slot, &observation)?)
+        Ok(player.replace_observation(slot, &observation)?)
     }
 }

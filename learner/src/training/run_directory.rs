@@ -134,7 +134,7 @@ impl RunDirectory {
     /// [`RunDirectoryError`] if there is no run, no checkpoint, or a checkpoint that cannot be resumed, or if another
     /// process is training there.
     pub fn resume(path: &Path) -> Result<(Self, Checkpoint, ResumeState)> {
-        if !files::look(path)?.is_some_and(|metadata| metadata.is_dir()) {
+        if !files::metadata_if_exists(path)?.is_some_and(|metadata| metadata.is_dir()) {
             return Err(RunDirectoryError::Missing { path: path.to_owned() });
         }
         let directory = Self::new(path, false, true);

@@ -12,7 +12,7 @@ use crate::records::PythonRecords;
 
 /// The fields of [`PolicyMetadata`] for Python: training version, training steps, seed of the tests, episodes of each
 /// test, what the policy observed (`state` or `parameters`), and whether the policy was deterministic.
-type KnownOf = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
+type PolicyMetadataTuple = (Option<String>, Option<u64>, u64, u64, String, Option<bool>);
 
 /// The recorded tests of one policy, or of several related policies, in one environment.
 #[pyclass(frozen, module = "perturb._native")]
@@ -21,9 +21,9 @@ pub struct Assessment(ExternalEvaluation);
 #[pymethods]
 impl Assessment {
     #[new]
-    fn new(agent: String, policies: Vec<(KnownOf, PyRef<'_, PythonRecords>)>) -> PyResult<Self> {
-        let policy = |(known, records): (KnownOf, PyRef<'_, PythonRecords>)| {
-            Ok(ExternalPolicy::new(known_of(known)?, records.0.clone()))
+    fn new(agent: String, policies: Vec<(PolicyMetadataTuple, PyRef<'_, PythonRecords>)>) -> PyResult<Self> {
+        let policy = |(known, records): (PolicyMetadataTuple, PyRef<'_, PythonRecords>)| {
+            Ok(ExternalPolicy::new(policy_metadata(known)?, records.0.clone()))
         };
         let policies = policies.into_iter().map(policy).collect::<PyResult<_>>()?;
         ExternalEvaluation::new(String::new(), agent, policies).map(Self).map_err(refused)
@@ -47,7 +47,7 @@ impl Assessment {
     }
 
     /// Returns the metadata and the records of each policy.
-    fn policies(&self) -> Vec<(KnownOf, PythonRecords)> {
+    fn policies(&self) -> Vec<(PolicyMetadataTuple, PythonRecords)> {
         let of = |policy: &ExternalPolicy| {
             let PolicyMetadata { trained_on, timesteps, seed, episodes, observe, deterministic } = policy.known.clone();
             let trained_on = trained_on.map(|version| version.to_string());
@@ -73,7 +73,9 @@ pub fn report_page(py: Python<'_>, assessments: Vec<PyRef<'_, Assessment>>, besi
     })
 }
 
-fn known_of((trained_on, timesteps, seed, episodes, observe, deterministic): KnownOf) -> PyResult<PolicyMetadata> {
+fn policy_metadata(
+    (trained_on, timesteps, seed, episodes, observe, deterministic): PolicyMetadataTuple,
+) -> PyResult<PolicyMetadata> {
     let invalid = |error: String| failure(INVALID, 0, error);
     let trained_on = trained_on.map(|version| version.parse()).transpose();
     let trained_on = trained_on.map_err(|error: perturb_protocol::UnknownVersion| invalid(error.to_string()))?;

@@ -57,7 +57,7 @@ pub struct InfoKeys {
     parameters: Vec<Label>,
     applied: Vec<Label>,
     reward_terms: Vec<Label>,
-    known: FixedLabels,
+    fixed: FixedLabels,
     /// SHA-256 of the model, as text; empty without a model.
     model_hash: String,
     /// The 32 bytes of the hash; zeros without a model.
@@ -90,7 +90,7 @@ impl InfoKeys {
             parameters: environment.parameters.iter().map(|it| Label::new(py, &it.name)).collect(),
             applied: environment.applied.iter().map(|it| Label::new(py, &it.name)).collect(),
             reward_terms: environment.reward_terms.iter().map(|it| Label::new(py, &it.name)).collect(),
-            known: FixedLabels::new(py),
+            fixed: FixedLabels::new(py),
             model_hash: environment.model_hash.clone(),
             model_hash_bytes: hash_bytes(&environment.model_hash),
         }
@@ -193,18 +193,18 @@ impl Events {
 impl Events {
     /// Returns the info of a single environment.
     pub fn single<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
-        let (info, known) = (PyDict::new(py), &self.labels.known);
+        let (info, fixed) = (PyDict::new(py), &self.labels.fixed);
         if !self.reward_terms.is_empty() {
             let named = PyDict::new(py);
             for (label, &term) in self.labels.reward_terms.iter().zip(&self.reward_terms) {
                 named.set_item(&label.key, term)?;
             }
-            info.set_item(&known.reward_terms.key, named)?;
+            info.set_item(&fixed.reward_terms.key, named)?;
         }
         if let Some(end) = self.ended.first() {
-            info.set_item(&known.is_success.key, end.success)?;
-            info.set_item(&known.diverged.key, end.diverged)?;
-            info.set_item(&known.achieved.key, end.achieved.unwrap_or(f64::NAN))?;
+            info.set_item(&fixed.is_success.key, end.success)?;
+            info.set_item(&fixed.diverged.key, end.diverged)?;
+            info.set_item(&fixed.achieved.key, end.achieved.unwrap_or(f64::NAN))?;
         }
         let values = |labels: &[Label], values: &[f64]| {
             let named = PyDict::new(py);
@@ -215,14 +215,14 @@ impl Events {
         {
             let (requested, applied) = row.split_at(self.labels.parameters.len());
             let receipt = PyDict::new(py);
-            receipt.set_item(&known.environment_index.key, environment)?;
-            receipt.set_item(&known.trial_index.key, trial)?;
-            receipt.set_item(&known.episode_index.key, episode)?;
-            receipt.set_item(&known.applied.key, values(&self.labels.applied, applied)?)?;
-            receipt.set_item(&known.model_hash.key, PyTuple::new(py, self.labels.model_hash_bytes)?)?;
-            info.set_item(&known.context_id.key, trial)?;
-            info.set_item(&known.parameters.key, values(&self.labels.parameters, requested)?)?;
-            info.set_item(&known.receipt.key, receipt)?;
+            receipt.set_item(&fixed.environment_index.key, environment)?;
+            receipt.set_item(&fixed.trial_index.key, trial)?;
+            receipt.set_item(&fixed.episode_index.key, episode)?;
+            receipt.set_item(&fixed.applied.key, values(&self.labels.applied, applied)?)?;
+            receipt.set_item(&fixed.model_hash.key, PyTuple::new(py, self.labels.model_hash_bytes)?)?;
+            info.set_item(&fixed.context_id.key, trial)?;
+            info.set_item(&fixed.parameters.key, values(&self.labels.parameters, requested)?)?;
+            info.set_item(&fixed.receipt.key, receipt)?;
         }
         Ok(info)
     }
@@ -237,7 +237,7 @@ impl Events {
         moved: Option<PyReadonlyArray1<'py, bool>>,
         same_step: bool,
     ) -> PyResult<Bound<'py, PyDict>> {
-        let (infos, known, n) = (PyDict::new(py), &self.labels.known, self.labels.num_envs);
+        let (infos, fixed, n) = (PyDict::new(py), &self.labels.fixed, self.labels.num_envs);
         let mut moved = match moved {
             Some(moved) => moved.as_slice()?.to_vec(),
             None => vec![true; n],
@@ -256,8 +256,8 @@ impl Events {
             moved[end.slot as usize] = false;
         }
         let (over, mask) = self.mask(py, self.ended.iter().map(|end| end.slot as usize));
-        set(&infos, &known.final_obs, PyArray1::from_vec(py, observations), &mask)?;
-        set(&infos, &known.final_info, &finals, &mask)?;
+        set(&infos, &fixed.final_obs, PyArray1::from_vec(py, observations), &mask)?;
+        set(&infos, &fixed.final_info, &finals, &mask)?;
         self.outcomes(&finals)?;
         self.receipts(&finals, [&self.ended_episodes])?;
         self.terms(&finals, &over)?;
@@ -275,15 +275,15 @@ impl Events {
         if self.ended.is_empty() {
             return Ok(());
         }
-        let (py, known) = (infos.py(), &self.labels.known);
+        let (py, fixed) = (infos.py(), &self.labels.fixed);
         let slots = || self.ended.iter().map(|end| end.slot as usize);
         let (_, mask) = self.mask(py, slots());
         let success = slots().zip(self.ended.iter().map(|end| end.success));
-        set(infos, &known.is_success, self.column(py, success), &mask)?;
+        set(infos, &fixed.is_success, self.column(py, success), &mask)?;
         let diverged = slots().zip(self.ended.iter().map(|end| end.diverged));
-        set(infos, &known.diverged, self.column(py, diverged), &mask)?;
+        set(infos, &fixed.diverged, self.column(py, diverged), &mask)?;
         let achieved = slots().zip(self.ended.iter().map(|end| end.achieved.unwrap_or(f64::NAN)));
-        set(infos, &known.achieved, self.column(py, achieved), &mask)
+        set(infos, &fixed.achieved, self.column(py, achieved), &mask)
     }
 
     /// Adds the parameters and receipts of the episodes in `tables` to `infos`. If several tables have an episode of
@@ -294,7 +294,7 @@ impl Events {
             return Ok(());
         }
         let (py, labels) = (infos.py(), &*self.labels);
-        let (known, slot) = (&labels.known, |row: &[u64; 5]| row[0] as usize);
+        let (fixed, slot) = (&labels.fixed, |row: &[u64; 5]| row[0] as usize);
         let (_, mask) = self.mask(py, rows().map(|(row, _)| slot(&row)));
         let count = |index: usize| self.column(py, rows().map(move |(row, _)| (row[0] as usize, row[index] as i64)));
         let named = |labels: &[Label], first: usize| {
@@ -305,20 +305,20 @@ impl Events {
             }
             PyResult::Ok(named)
         };
-        set(infos, &known.context_id, count(2), &mask)?;
-        set(infos, &known.parameters, named(&labels.parameters, 0)?, &mask)?;
+        set(infos, &fixed.context_id, count(2), &mask)?;
+        set(infos, &fixed.parameters, named(&labels.parameters, 0)?, &mask)?;
         let receipt = PyDict::new(py);
-        for (index, label) in [(1, &known.environment_index), (2, &known.trial_index), (3, &known.episode_index)] {
+        for (index, label) in [(1, &fixed.environment_index), (2, &fixed.trial_index), (3, &fixed.episode_index)] {
             set(&receipt, label, count(index), &mask)?;
         }
-        set(&receipt, &known.applied, named(&labels.applied, labels.parameters.len())?, &mask)?;
+        set(&receipt, &fixed.applied, named(&labels.applied, labels.parameters.len())?, &mask)?;
         let mut hashes = vec![0; labels.num_envs * HASH_BYTES];
         rows().for_each(|(row, _)| {
             hashes[slot(&row) * HASH_BYTES..][..HASH_BYTES].copy_from_slice(&labels.model_hash_bytes);
         });
         let hashes = PyArray1::from_vec(py, hashes).reshape([labels.num_envs, HASH_BYTES])?;
-        set(&receipt, &known.model_hash, hashes, &mask)?;
-        set(infos, &known.receipt, receipt, &mask)
+        set(&receipt, &fixed.model_hash, hashes, &mask)?;
+        set(infos, &fixed.receipt, receipt, &mask)
     }
 
     fn terms(&self, infos: &Bound<'_, PyDict>, moved: &[bool]) -> PyResult<()> {
@@ -332,7 +332,7 @@ impl Events {
             let column = slots().map(|slot| (slot, f64::from(self.reward_terms[slot * names.len() + i])));
             set(&named, label, self.column(py, column), &mask)?;
         }
-        set(infos, &self.labels.known.reward_terms, named, &mask)
+        set(infos, &self.labels.fixed.reward_terms, named, &mask)
     }
 
     /// Makes an array `[N]` from pairs of a slot and a value. Slots without a value are zero.

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 
 use numpy::{PyArray1, PyReadonlyArray1};
 use perturb_records::outcomes::{
-    Bin, Counted, Outcomes, SHARE, bins, conditional_value_at_risk, success_within, success_within_both, worst_contexts,
+    Bin, Outcomes, SHARE, SuccessCount, bins, conditional_value_at_risk, success_within, success_within_both,
+    worst_contexts,
 };
 use perturb_records::statistics::{bootstrap, mean};
 use perturb_records::success::{Criterion, Rule, Side};
@@ -170,7 +171,7 @@ impl PythonRecords {
         let [over_x, over_y] = [&bins[0], &bins[1]];
         let counted = success_within_both(&outcomes, places, [over_x, over_y]);
         let pairs = over_y.iter().flat_map(|y| over_x.iter().map(move |x| (x, y)));
-        let cell = |((x, y), counted): ((&Bin, &Bin), Counted)| {
+        let cell = |((x, y), counted): ((&Bin, &Bin), SuccessCount)| {
             ((x.low, x.high), (y.low, y.high), counted.successes, counted.episodes)
         };
         Ok(pairs.zip(counted).map(cell).collect())

@@ -73,7 +73,7 @@ class Client:
         contexts: Sequence[Mapping[str, float]] | None = None,
     ) -> None:
         requests.render_mode(render_mode)
-        self._drawn = render_mode is not None
+        self._can_render = render_mode is not None
         self._width, self._height = requests.pixels(width, "width"), requests.pixels(height, "height")
         self._timeout = requests.seconds(timeout, "timeout")
         self._server = None if server is None else parse_address(server)
@@ -87,10 +87,10 @@ class Client:
         self._parameters = requests.distributions(parameters)
         # For each environment, the parameters that replace the parameters of the batch. The list is empty if no
         # environment has parameters of its own.
-        self._own: list[requests.Intervals] = []
+        self._own_parameters: list[requests.Intervals] = []
         if contexts is not None:
             self._set_contexts(requests.contexts(contexts))
-        named = {*self._parameters, *(name for own in self._own for name in own)}
+        named = {*self._parameters, *(name for own in self._own_parameters for name in own)}
         self.description = self.description.with_parameters(named)
         if self.description.is_disturbed:
             # A session has disturbances only if the request that opens it names a disturbance. Contexts are sent later,
@@ -171,8 +171,8 @@ class Client:
             if self._task is not None:
                 self.description.require_same_model(served)
             begun = OpenedSession(opened, opened.observations, opened.events)
-            if any(self._own):  # some environments have parameters of their own, which resets set
-                begun = self._give_own(session, opened, seed)
+            if any(self._own_parameters):  # some environments have parameters of their own, which resets set
+                begun = self._set_own_parameters(session, opened, seed)
         except BaseException:
             session.close()
             raise
@@ -193,18 +193,18 @@ class Client:
                 "as many environments"
             )
         fixed = [{name: [(value, value)] for name, value in context.items()} for context in contexts]
-        self._own = [fixed[slot % count] for slot in range(self.num_envs)]
+        self._own_parameters = [fixed[slot % count] for slot in range(self.num_envs)]
 
-    def _give_own(self, session: Session, opened: Opened, seed: int) -> OpenedSession:
+    def _set_own_parameters(self, session: Session, opened: Opened, seed: int) -> OpenedSession:
         """Set the environments' own parameters by resets, one for each group of environments with equal parameters."""
         slots: dict[Any, list[int]] = {}
-        for slot, own in enumerate(self._own):
+        for slot, own in enumerate(self._own_parameters):
             if own:
                 slots.setdefault(requests.frozen(own), []).append(slot)
         for alike in slots.values():
             mask = np.zeros(self.num_envs, np.bool_)
             mask[alike] = True
-            session.reset(mask.tobytes(), [seed] * len(alike), self._own[alike[0]], b"")
+            session.reset(mask.tobytes(), [seed] * len(alike), self._own_parameters[alike[0]], b"")
         # Begin the first episodes once more, all in one reset, so that one reply has all observations and episodes.
         return OpenedSession(opened, *session.reset(b"", [seed] * self.num_envs, {}, b""))
 
@@ -218,18 +218,20 @@ class Client:
             observations, begun = self.session.reset(_bytes(mask), seeds, parameters, states)
             events.append(begun)
             if parameters:
-                self._keep(mask, parameters)
+                self._store_parameters(mask, parameters)
         return observations, events
 
-    def _keep(self, mask: NDArray[np.bool_] | None, parameters: requests.Intervals) -> None:
+    def _store_parameters(self, mask: NDArray[np.bool_] | None, parameters: requests.Intervals) -> None:
         """Store parameters that the selected environments keep for later episodes. `mask` None selects all."""
         if mask is None or mask.all():
             self._parameters = {**self._parameters, **parameters}
-            self._own = [{name: it for name, it in own.items() if name not in parameters} for own in self._own]
+            self._own_parameters = [
+                {name: it for name, it in own.items() if name not in parameters} for own in self._own_parameters
+            ]
             return
-        self._own = self._own or [{} for _ in range(self.num_envs)]
+        self._own_parameters = self._own_parameters or [{} for _ in range(self.num_envs)]
         for slot in np.flatnonzero(mask).tolist():
-            self._own[slot] = {**self._own[slot], **parameters}
+            self._own_parameters[slot] = {**self._own_parameters[slot], **parameters}
 
     def last_ended(self) -> NDArray[np.bool_]:
         """Return a mask [N] of the environments whose episode ended in the last step and that were not reset since."""
@@ -258,7 +260,7 @@ class Client:
 
     def render(self, slot: int) -> NDArray[np.uint8]:
         """Draw the environment in a slot of the batch. Return a picture, uint8 [height, width, 3]."""
-        if not self._drawn:
+        if not self._can_render:
             raise OutOfOrderError("render() is for environments that were made with render_mode='rgb_array'")
         return self.session.render(slot, self._width, self._height)
 

@@ -84,20 +84,20 @@ def prepare(
         loaded = policy._native
         player = lambda num_envs, seed: native(loaded.player, num_envs, seed, 0)  # noqa: E731
         return PolicyUnderTest(policy.id, player, policy.method, policy, loaded.timesteps, False)
-    if _is(policy, "stable_baselines3.common.base_class", "BaseAlgorithm"):
+    if _is_instance_of(policy, "stable_baselines3.common.base_class", "BaseAlgorithm"):
         # The default is the mode of the action distribution, as in stable-baselines3's evaluate_policy.
         return _stable_baselines(policy, description, deterministic is not False, normalizer, name)
     if deterministic:
         raise PolicyError("deterministic=True is for stable-baselines3's models: make the policy itself deterministic")
     if normalizer not in (None, False):
         raise PolicyError("normalizer= is for stable-baselines3's models: let the policy itself normalise")
-    if _is(policy, "torch.nn", "Module"):
+    if _is_instance_of(policy, "torch.nn", "Module"):
         digest = _digest(_tensors(policy.state_dict()))
         player = lambda _num_envs, _seed: _Module(policy, description)  # noqa: E731
         called = type(policy).__name__
         return PolicyUnderTest(name or f"{called} {digest}", player, name or called)
     if callable(policy):
-        remembers = _remembers(policy)
+        remembers = _has_memory(policy)
         called = getattr(policy, "__qualname__", type(policy).__qualname__)
         named = name or f"function {called}"
         return PolicyUnderTest(named, lambda _num_envs, _seed: _Function(policy, remembers), named)
@@ -107,12 +107,12 @@ def prepare(
     )
 
 
-def _is(policy: Any, module: str, name: str) -> bool:
+def _is_instance_of(policy: Any, module: str, name: str) -> bool:
     known = getattr(sys.modules.get(module), name, None)
     return isinstance(known, type) and isinstance(policy, known)
 
 
-def _remembers(function: Callable[..., Any]) -> bool:
+def _has_memory(function: Callable[..., Any]) -> bool:
     """Whether a function has memory. A function with memory requires three arguments.
 
     Raises:
@@ -142,7 +142,7 @@ class _Function:
 
     def __init__(self, function: Callable[..., Any], remembers: bool) -> None:
         self._function = function
-        self._remembers = remembers
+        self._has_memory = remembers
         self._memory: Any = None
 
     def begin(self, observations: NDArray[np.float32]) -> None:
@@ -151,7 +151,7 @@ class _Function:
 
     def act(self) -> Any:
         observations = self._observations.copy()  # the function may change its argument
-        if not self._remembers:
+        if not self._has_memory:
             return self._function(observations)
         result = self._function(observations, self._memory, self._starts)
         if not isinstance(result, tuple) or len(result) != 2:

@@ -270,15 +270,15 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
     return values
 
 
-def count(value: Any, name: str, least: int, most: int = 2**32 - 1) -> int:
-    """Check an integer from `least` to `most`, and return it as an int."""
+def count(value: Any, name: str, minimum: int, maximum: int = 2**32 - 1) -> int:
+    """Check an integer from `minimum` to `maximum`, and return it as an int."""
     try:
         number = -1 if isinstance(value, bool) else operator.index(value)
     except TypeError:
         number = -1
-    if not least <= number <= most:
-        limit = "2^32 - 1" if most == 2**32 - 1 else most
-        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {least} to {limit}")
+    if not minimum <= number <= maximum:
+        limit = "2^32 - 1" if maximum == 2**32 - 1 else maximum
+        raise InvalidArgumentError(f"{name}={value!r}; expected an integer from {minimum} to {limit}")
     return number
 
 

@@ -131,7 +131,7 @@ class Session:
 
     def usable(self) -> bool:
         """Whether requests can be sent: the session is not lost, and this process opened it."""
-        return os.getpid() == self._owner and self._gone() is None
+        return os.getpid() == self._owner and self._end_reason() is None
 
     def require_usable(self) -> None:
         """Check that requests can be sent.
@@ -144,11 +144,11 @@ class Session:
                 f"process {self._owner} opened this environment's session, and process {os.getpid()} was forked from "
                 "it: call reset() to open one here, or make the environment after the fork"
             )
-        gone = self._gone()
+        gone = self._end_reason()
         if gone is not None:
             raise OutOfOrderError(f"this environment is gone, call reset() to begin anew: {gone}")
 
-    def _gone(self) -> str | None:
+    def _end_reason(self) -> str | None:
         """Return the reason why the session has ended, or None if it has not."""
         # `_failed` stores the reason in `_lost`. If a second Ctrl-C interrupts it, the native session has ended, but no
         # reason is stored.
@@ -430,10 +430,11 @@ class _KeepaliveThread:
         while not self._ended.wait(POLL_INTERVAL):
             self._note_pause()
             self._last_run = _now()
-            self._look()  # a separate function, so that no local variable keeps a session alive during the wait
+            # A separate function, so that no local variable keeps a session alive during the wait.
+            self._poll_sessions()
             _close_unclosed(wait=False)  # without waiting, because pings must be answered while a server starts
 
-    def _look(self) -> None:
+    def _poll_sessions(self) -> None:
         for session in self.sessions():
             session.poll_io()
 

@@ -16,7 +16,7 @@ impl ExperimentFixture {
         let directory = tempfile::tempdir().unwrap();
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let fixture = Self { directory, plan };
-        fixture.folder().keep_plan(&fixture.plan).unwrap();
+        fixture.folder().store_plan(&fixture.plan).unwrap();
         fixture
     }
 

@@ -23,7 +23,7 @@ use serde_json::{Map, Value, json};
 
 use crate::cached_loader::CachedLoadError;
 use crate::error::ViewError;
-use crate::links::WayUp;
+use crate::links::RelativeRoot;
 use crate::paths::{RelativePath, Root};
 
 /// The changing content of a page.
@@ -56,8 +56,8 @@ pub(crate) struct ReportSource {
 
 impl Update {
     /// Makes the links of the page's parts relative.
-    pub(crate) fn with_relative_links(mut self, way_up: &WayUp) -> Self {
-        let relative = |part: &Markup| PreEscaped(way_up.relative_links(&part.0));
+    pub(crate) fn with_relative_links(mut self, relative_root: &RelativeRoot) -> Self {
+        let relative = |part: &Markup| PreEscaped(relative_root.relative_links(&part.0));
         self.parts.iter_mut().for_each(|(_, part)| *part = relative(part));
         self
     }

@@ -202,11 +202,11 @@ fn settings(training: &LiveTraining) -> Markup {
     let table = status.config.table();
     html! {
         h2 { "Settings" }
-        dl.settings { @for (name, value) in &table { div { dt { (name) } dd { (shown(value)) } } } }
+        dl.settings { @for (name, value) in &table { div { dt { (name) } dd { (format_value(value)) } } } }
     }
 }
 
-fn shown(value: &toml::Value) -> String {
+fn format_value(value: &toml::Value) -> String {
     shortened(value.as_str().map_or_else(|| value.to_string(), str::to_owned))
 }
 

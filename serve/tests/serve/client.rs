@@ -41,7 +41,7 @@ impl Place {
         write_training(&runs.join("one"), 30);
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let study = ExperimentFolder::new(&runs.join("study"));
-        study.keep_plan(&plan).unwrap();
+        study.store_plan(&plan).unwrap();
         study.cell(&plan.cells[0].id).write_result(&result(&plan.cells[0])).unwrap();
         write(&runs.join("pictures/over <b>.svg"), "<svg xmlns='http://www.w3.org/2000/svg'/>");
         let address = serve(&runs);

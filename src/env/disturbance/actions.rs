@@ -1,6 +1,6 @@
 //! Disturbs actions: delay, repetition (`action_hold`), noise and scale.
 
-use super::{next_place, parameters::DisturbanceValues};
+use super::{next_offset, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the actions of one environment on their way to the physics. An action is stored as A numbers: a continuous
@@ -10,8 +10,8 @@ pub(super) struct ActionPath {
     /// The action that acts until the client's first action arrives, `[A]`.
     neutral: Vec<f32>,
     /// A ring buffer of the client's actions that have not reached the physics yet, `[action_delay, A]`.
-    late: Vec<f32>,
-    /// The index in `late` of the first number of the oldest action.
+    delayed: Vec<f32>,
+    /// The index in `delayed` of the first number of the oldest action.
     oldest: usize,
     /// The action of the current step before noise and scale, `[A]`. `action_hold` may repeat it in the next step.
     held: Vec<f32>,
@@ -23,21 +23,21 @@ impl ActionPath {
     /// Creates the path for actions of `space`. `neutral` is the environment's action with the least effect, `[A]`.
     pub(super) fn new(space: ActionSpec, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
-        Self { space, neutral, late: Vec::new(), oldest: 0, held, acting }
+        Self { space, neutral, delayed: Vec::new(), oldest: 0, held, acting }
     }
 
     /// Begins an episode. The neutral action acts until the client's first action arrives.
     pub(super) fn begin(&mut self, values: &DisturbanceValues) {
-        self.late.clear();
+        self.delayed.clear();
         for _ in 0..values.action_delay {
-            self.late.extend_from_slice(&self.neutral);
+            self.delayed.extend_from_slice(&self.neutral);
         }
         self.oldest = 0;
         self.held.copy_from_slice(&self.neutral);
     }
 
     /// Takes the client's action for step number `step`, counted from 0. Returns the disturbed action for the physics.
-    pub(super) fn pass(
+    pub(super) fn apply(
         &mut self,
         values: &DisturbanceValues,
         draw: &Draw,
@@ -63,12 +63,12 @@ impl ActionPath {
                 self.held.copy_from_slice(action);
             }
         } else {
-            let place = &mut self.late[self.oldest..][..width];
+            let place = &mut self.delayed[self.oldest..][..width];
             if !is_held {
                 self.held.copy_from_slice(place);
             }
             place.copy_from_slice(action);
-            self.oldest = next_place(self.oldest, width, self.late.len());
+            self.oldest = next_offset(self.oldest, width, self.delayed.len());
         }
         // Noise and scale change only `acting`, so a repeated action gets new noise.
         self.acting.copy_from_slice(&self.held);
@@ -100,7 +100,7 @@ impl ActionPath {
 
     /// Appends `held`, then the delayed actions, oldest first.
     pub(super) fn save(&self, out: &mut Vec<f64>) {
-        let (newer, older) = self.late.split_at(self.oldest);
+        let (newer, older) = self.delayed.split_at(self.oldest);
         out.extend([&self.held[..], older, newer].into_iter().flatten().map(|&number| f64::from(number)));
     }
 
@@ -117,9 +117,9 @@ impl ActionPath {
             return Err(Error::Snapshot { reason: format!("{number} is in one of its late actions") });
         }
         self.begin(values);
-        let (held, late) = saved.split_at(self.held.len());
+        let (held, delayed) = saved.split_at(self.held.len());
         self.held.iter_mut().zip(held).for_each(|(to, from)| *to = *from as f32);
-        self.late.iter_mut().zip(late).for_each(|(to, from)| *to = *from as f32);
+        self.delayed.iter_mut().zip(delayed).for_each(|(to, from)| *to = *from as f32);
         Ok(())
     }
 }

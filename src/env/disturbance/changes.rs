@@ -15,7 +15,7 @@ pub(super) struct ChangingPhysics {
     /// The quantities of `EnvironmentSpec::applied` with the normal set and with the changed set.
     applied: [Vec<f64>; 2],
     /// For each parameter, the index in `EnvironmentSpec::applied` of the quantity that reads the parameter back.
-    places: Vec<usize>,
+    applied_indices: Vec<usize>,
     /// A buffer for the state of the physics during a change.
     state: Vec<f64>,
 }
@@ -25,11 +25,12 @@ impl ChangingPhysics {
     pub(super) fn new(environment: Box<dyn Environment>) -> Self {
         let spec = environment.spec();
         let place = |name: &str| spec.applied.iter().position(|quantity| quantity.name == name);
-        let places = spec.parameters.iter().map(|parameter| place(parameter.applied));
-        let places = places.map(|place| place.expect("every parameter is read back; a test checks each")).collect();
+        let applied_indices = spec.parameters.iter().map(|parameter| place(parameter.applied));
+        let applied_indices =
+            applied_indices.map(|place| place.expect("every parameter is read back; a test checks each")).collect();
         let sets = [(); 2].map(|()| vec![0.0; spec.parameters.len()]);
         let applied = [(); 2].map(|()| vec![0.0; spec.applied.len()]);
-        Self { environment, is_changing: false, is_changed: false, sets, applied, places, state: Vec::new() }
+        Self { environment, is_changing: false, is_changed: false, sets, applied, applied_indices, state: Vec::new() }
     }
 
     /// Stores the normal parameters `own` and the changed parameters `values.changed`, and applies the normal
@@ -58,7 +59,7 @@ impl ChangingPhysics {
     /// Returns the value that the parameter with index `parameter` has in the changed set, read back from the physics.
     /// Returns `None` if the physics cannot change.
     pub(super) fn changed(&self, parameter: usize) -> Option<f64> {
-        self.is_changing.then(|| self.applied[1][self.places[parameter]])
+        self.is_changing.then(|| self.applied[1][self.applied_indices[parameter]])
     }
 
     /// Prepares a new episode: applies the normal parameters if the physics have the changed set. The state is then
@@ -75,7 +76,7 @@ impl ChangingPhysics {
     ///
     /// # Errors
     /// [`Error::Snapshot`] if the state is not valid with the other parameters. After an error, the state is undefined.
-    pub(super) fn pass(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> Result<(), Error> {
+    pub(super) fn apply(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> Result<(), Error> {
         if !(self.is_changing && begins_with_change(values, draw, step)) {
             return Ok(());
         }

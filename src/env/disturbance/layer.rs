@@ -117,14 +117,14 @@ impl Environment for Disturbed {
     }
 
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition {
-        let action = self.actions.pass(&self.values, &self.draw, self.steps, action);
+        let action = self.actions.apply(&self.values, &self.draw, self.steps, action);
         if self.values.push > 0.0
             && let Some(push) = self.spec.push
             && let Some(impulse) = impulse(&self.values, &self.draw, self.steps, push.axes)
         {
             self.physics.environment.push(impulse);
         }
-        let transition = match self.physics.pass(&self.values, &self.draw, self.steps) {
+        let transition = match self.physics.apply(&self.values, &self.draw, self.steps) {
             Ok(()) => self.physics.environment.step(action, reward_terms),
             Err(_) => {
                 reward_terms.fill(0.0);
@@ -132,7 +132,7 @@ impl Environment for Disturbed {
             }
         };
         self.steps += 1;
-        self.sensors.pass(&self.values, &self.draw, self.steps, |out| self.physics.environment.observe(out));
+        self.sensors.apply(&self.values, &self.draw, self.steps, |out| self.physics.environment.observe(out));
         transition
     }
 

@@ -138,7 +138,7 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
 
 /// Returns the offset of the entry that follows the entry at offset `place`, in a ring buffer of `length` numbers with
 /// entries of `width` numbers. A comparison is used, because a remainder would cost a division in each step.
-fn next_place(place: usize, width: usize, length: usize) -> usize {
+fn next_offset(place: usize, width: usize, length: usize) -> usize {
     let next = place + width;
     if next < length { next } else { 0 }
 }

@@ -1,6 +1,6 @@
 //! Disturbs observations: delay, noise and dropout.
 
-use super::{next_place, parameters::DisturbanceValues};
+use super::{next_offset, parameters::DisturbanceValues};
 use crate::env::{ChannelSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
@@ -30,12 +30,12 @@ impl SensorPath {
         observe(first);
         others.chunks_exact_mut(width.max(1)).for_each(|other| other.copy_from_slice(first));
         self.newest = 0;
-        self.see(values, draw, 0);
+        self.update_seen(values, draw, 0);
     }
 
     /// Adds the exact observation after `steps` steps of the episode. The callback `observe` writes this observation.
     /// Updates the observation that the policy sees.
-    pub(super) fn pass(
+    pub(super) fn apply(
         &mut self,
         values: &DisturbanceValues,
         draw: &Draw,
@@ -43,9 +43,9 @@ impl SensorPath {
         observe: impl FnOnce(&mut [f32]),
     ) {
         let width = self.channels.len();
-        self.newest = next_place(self.newest, width, self.exact.len());
+        self.newest = next_offset(self.newest, width, self.exact.len());
         observe(&mut self.exact[self.newest..][..width]);
-        self.see(values, draw, steps);
+        self.update_seen(values, draw, steps);
     }
 
     /// Returns the disturbed observation that the policy sees, `[O]`.
@@ -55,9 +55,9 @@ impl SensorPath {
 
     /// Computes the observation that the policy sees: the oldest observation in the ring buffer, with noise and
     /// dropout.
-    fn see(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
+    fn update_seen(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
         let width = self.channels.len();
-        let oldest = next_place(self.newest, width, self.exact.len());
+        let oldest = next_offset(self.newest, width, self.exact.len());
         self.seen.copy_from_slice(&self.exact[oldest..][..width]);
         if values.sensor_noise > 0.0 {
             let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorNoise, steps);
@@ -112,7 +112,7 @@ impl SensorPath {
         self.newest = saved.len();
         self.exact.iter_mut().zip(saved).for_each(|(to, from)| *to = *from as f32);
         observe(&mut self.exact[self.newest..]);
-        self.see(values, draw, steps);
+        self.update_seen(values, draw, steps);
         Ok(())
     }
 }

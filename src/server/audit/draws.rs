@@ -180,7 +180,7 @@ impl DrawAuditor {
         {
             self.write_later(
                 ledger,
-                LedgerEvent::Refused { who: self.who(spec), region: region.clone(), reason: reason.clone() },
+                LedgerEvent::Refused { who: self.ledger_session(spec), region: region.clone(), reason: reason.clone() },
             );
         }
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
@@ -232,7 +232,7 @@ impl DrawAuditor {
         }
     }
 
-    fn who(&self, spec: &EnvironmentSpec) -> LedgerSession {
+    fn ledger_session(&self, spec: &EnvironmentSpec) -> LedgerSession {
         LedgerSession {
             session: self.session,
             token: self.bearer.as_ref().map(|bearer| bearer.name().into()),
@@ -248,7 +248,7 @@ impl DrawAuditor {
         begins: Vec<DrawStart>,
         ends: Vec<DrawEnd>,
     ) -> LedgerEvent {
-        LedgerEvent::Draws(ledger::DrawRecord { who: self.who(spec), regions, begins, ends })
+        LedgerEvent::Draws(ledger::DrawRecord { who: self.ledger_session(spec), regions, begins, ends })
     }
 }
 

@@ -6,7 +6,7 @@ use crate::server::error::InvalidValue;
 use perturb_protocol::ledger::{Chain, LedgerEvent, MAX_LINE_BYTES, read};
 use perturb_system::{
     explain_no_thread,
-    support::{Operation, is_taken, unless_unsupported},
+    support::{Operation, is_acquired, unless_unsupported},
 };
 use std::{
     fs::{File, OpenOptions},
@@ -73,7 +73,7 @@ impl Ledger {
                 "that is not a regular file, and the server must read its ledger at each start",
             ));
         }
-        if is_taken(file.try_lock(), path)? == Some(false) {
+        if is_acquired(file.try_lock(), path)? == Some(false) {
             return Err(io::Error::other("another server writes it"));
         }
         let existing = read(path, |_, _| {}).map_err(io::Error::other)?;

@@ -27,7 +27,7 @@ use std::{
     time::Duration,
 };
 use subtle::ConstantTimeEq;
-use token_file::{ParsedToken, TokenEntry, listed};
+use token_file::{ParsedToken, TokenEntry};
 use tokio::sync::Notify;
 use tonic::{body::Body, codegen::http};
 
@@ -217,7 +217,7 @@ impl Tokens {
     /// # Errors
     /// [`TokenFileError`], if the text is invalid; the tokens are unchanged then.
     pub fn reload(&self, text: &str) -> Result<(), TokenFileError> {
-        let listed = listed(&self.catalogue, text)?;
+        let listed = token_file::parse(&self.catalogue, text)?;
         let mut tokens = self.good.write().unwrap_or_else(PoisonError::into_inner);
         let mut renewed = Vec::with_capacity(listed.len());
         for ParsedToken { digest, entry, role } in listed {

@@ -79,7 +79,7 @@ pub(super) struct ParsedToken {
 }
 
 /// Parses and checks a token file. The file's parameter sets may refer to the environments of `catalogue`.
-pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
+pub(super) fn parse(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken>, TokenFileError> {
     let line = |byte: usize| 1 + text.bytes().take(byte).filter(|byte| *byte == b'\n').count();
     let TokenFile { token: entries, role: roles, set: sets } = toml::from_str(text).map_err(|error| {
         // The parser's message may quote a token. Messages about keys quote none, so only these messages are passed on.
@@ -108,7 +108,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
     for role in roles {
         let line = line(role.span().start);
         let RoleEntry { name, draws, never } = role.into_inner();
-        let find = |names: Vec<String>| names.iter().map(|name| found("set", name, &known_sets)).collect();
+        let find = |names: Vec<String>| names.iter().map(|name| look_up("set", name, &known_sets)).collect();
         let sets: Result<(Option<Vec<DrawSet>>, Vec<DrawSet>), String> =
             draws.map(find).transpose().and_then(|draws| Ok((draws, find(never)?)));
         let (draws, never) = sets.map_err(|what| TokenFileError { line, what })?;
@@ -142,7 +142,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
                 what: format!("the token of {:?} is also the token of another entry", entry.name),
             });
         }
-        let role = entry.role.as_ref().map(|role| found("role", role, &known_roles)).transpose();
+        let role = entry.role.as_ref().map(|role| look_up("role", role, &known_roles)).transpose();
         let role = role.map_err(|what| TokenFileError { line, what })?;
         listed.push(ParsedToken { digest, entry, role });
     }
@@ -150,7 +150,7 @@ pub(super) fn listed(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToke
 }
 
 /// Looks up the role or set with this name.
-fn found<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Result<T, String> {
+fn look_up<T: Clone>(what: &str, name: &str, known: &BTreeMap<String, T>) -> Result<T, String> {
     let names = || known.keys().map(|name| format!("{name:?}")).collect::<Vec<_>>().join(", ");
     known.get(name).cloned().ok_or_else(|| format!("there is no {what} {name:?}; there are {}", names()))
 }
@@ -218,7 +218,7 @@ pub fn new_token(name: &str) -> std::io::Result<(String, String)> {
     let token = hex(&bits);
     let name = toml::Value::String(name.into());
     let entry = format!("[[token]]\nname = {name}\nsha256 = \"{:x}\"\n", Sha256::digest(&token));
-    listed(&Catalogue::default(), &entry).map_err(std::io::Error::other)?;
+    parse(&Catalogue::default(), &entry).map_err(std::io::Error::other)?;
     Ok((token, entry))
 }
 

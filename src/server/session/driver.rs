@@ -61,13 +61,13 @@ impl Sessions {
             status(&error)
         })?;
         let (responses, mut received) = mpsc::channel::<Result<OutgoingResponse<H::Response>, Status>>(1);
-        let outbox = requests.outbox.clone();
+        let pending_reservations = requests.pending_reservations.clone();
         let exchange = Exchange::new(requests, handler, Arc::clone(counts), self.enter(), admission);
         SessionDriver { exchange, lease: None }.spawn(&Handle::current(), responses);
         let stream = stream::poll_fn(move |context| {
             received.poll_recv(context).map(|response| {
                 Some(response?.map(|OutgoingResponse { response, memory }| {
-                    memory.into_iter().for_each(|reservation| outbox.push(reservation));
+                    memory.into_iter().for_each(|reservation| pending_reservations.push(reservation));
                     response
                 }))
             })

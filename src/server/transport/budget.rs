@@ -174,15 +174,15 @@ mod tests {
 
     #[test]
     fn a_share_is_held_until_the_last_of_its_bytes_is_dropped() {
-        let (budget, outbox) = (Budget::new(10), PendingReservations::default());
-        outbox.push(budget.reserve(10).unwrap());
-        let mut sent = outbox.attach(Bytes::from_static(b"reply"), || ());
+        let (budget, pending_reservations) = (Budget::new(10), PendingReservations::default());
+        pending_reservations.push(budget.reserve(10).unwrap());
+        let mut sent = pending_reservations.attach(Bytes::from_static(b"reply"), || ());
         let rest = sent.split_off(2);
         drop(sent);
         assert!(budget.reserve(1).is_err());
         assert_eq!(rest, "ply");
         drop(rest);
         assert!(budget.reserve(10).is_ok());
-        assert_eq!(outbox.attach(Bytes::from_static(b"small"), || ()), "small");
+        assert_eq!(pending_reservations.attach(Bytes::from_static(b"small"), || ()), "small");
     }
 }

@@ -61,7 +61,7 @@ pub struct MessageReader {
     /// The token of the call; `None` if the server requires none.
     pub bearer: Option<Bearer>,
     /// The queue for memory reservations of the stream's replies.
-    pub outbox: PendingReservations,
+    pub pending_reservations: PendingReservations,
 }
 
 /// The state of a message whose header has been read.
@@ -118,7 +118,7 @@ impl MessageReader {
         stream_limits: StreamLimits,
         connection: Option<ConnectionHandle>,
         bearer: Option<Bearer>,
-        outbox: PendingReservations,
+        pending_reservations: PendingReservations,
     ) -> Self {
         Self {
             body,
@@ -130,7 +130,7 @@ impl MessageReader {
             stream_limits,
             connection,
             bearer,
-            outbox,
+            pending_reservations,
         }
     }
 
@@ -142,8 +142,8 @@ impl MessageReader {
     /// Moves the reader out and leaves a reader without messages in its place.
     pub fn detach(&mut self) -> Self {
         let (connection, bearer) = (self.connection.clone(), self.bearer.clone());
-        let outbox = PendingReservations::default();
-        let left = Self::new(Body::empty(), None, self.stream_limits.clone(), connection, bearer, outbox);
+        let pending_reservations = PendingReservations::default();
+        let left = Self::new(Body::empty(), None, self.stream_limits.clone(), connection, bearer, pending_reservations);
         std::mem::replace(self, left)
     }
 

@@ -78,7 +78,7 @@ where
     }
 
     fn call(&mut self, mut request: http::Request<Body>) -> Self::Future {
-        let outbox = PendingReservations::default();
+        let pending_reservations = PendingReservations::default();
         let connection = request.extensions().get::<ConnectionHandle>().cloned();
         let is_stream = request.uri().path() == self.path;
         // Unary calls have one small reply, which needs no timeout.
@@ -90,13 +90,21 @@ where
                 StreamLimits { budget: self.stream_limits.budget.for_token(bearer.clone()), ..self.stream_limits };
             let body = std::mem::take(request.body_mut());
             let compression = Compression::from_headers(request.headers());
-            let reader =
-                MessageReader::new(body, compression, stream_limits, connection.clone(), bearer, outbox.clone());
+            let reader = MessageReader::new(
+                body,
+                compression,
+                stream_limits,
+                connection.clone(),
+                bearer,
+                pending_reservations.clone(),
+            );
             request.extensions_mut().insert(RawBody(Arc::new(Mutex::new(Some(reader)))));
         }
         let response = self.service.call(request);
         Box::pin(async move {
-            Ok(response.await?.map(|body| Body::new(WatchedBody::new(body, outbox, connection, timeouts))))
+            Ok(response
+                .await?
+                .map(|body| Body::new(WatchedBody::new(body, pending_reservations, connection, timeouts))))
         })
     }
 }

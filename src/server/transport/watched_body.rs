@@ -32,7 +32,7 @@ pub struct ReadTimeouts {
 /// The response body of a stream. The connection ends if the client does not read the body in time.
 pub struct WatchedBody {
     body: Body,
-    outbox: PendingReservations,
+    pending_reservations: PendingReservations,
     progress: Arc<ReadProgress>,
 }
 
@@ -121,11 +121,11 @@ impl Drop for UnreadGuard {
 }
 
 impl WatchedBody {
-    /// Wraps a response body. Attaches the reservations in `outbox` to its bytes, and closes `connection` if the client
-    /// leaves replies unread for longer than `timeouts`.
+    /// Wraps a response body. Attaches the reservations in `pending_reservations` to its bytes, and closes `connection`
+    /// if the client leaves replies unread for longer than `timeouts`.
     pub fn new(
         body: Body,
-        outbox: PendingReservations,
+        pending_reservations: PendingReservations,
         connection: Option<ConnectionHandle>,
         timeouts: Option<ReadTimeouts>,
     ) -> Self {
@@ -134,7 +134,7 @@ impl WatchedBody {
             let watch = tokio::spawn(watch(Arc::downgrade(&progress), connection, timeouts));
             progress.watch.get_or_init(|| watch.abort_handle());
         }
-        Self { body, outbox, progress }
+        Self { body, pending_reservations, progress }
     }
 }
 
@@ -161,7 +161,7 @@ impl HttpBody for WatchedBody {
     type Error = Status;
 
     fn poll_frame(mut self: Pin<&mut Self>, context: &mut Context<'_>) -> Poll<Option<Result<Frame<Bytes>, Status>>> {
-        let Self { body, outbox, progress } = &mut *self;
+        let Self { body, pending_reservations, progress } = &mut *self;
         progress.on_poll();
         let polled = Pin::new(body).poll_frame(context);
         if let Poll::Ready(Some(Ok(frame))) = &polled
@@ -169,7 +169,7 @@ impl HttpBody for WatchedBody {
         {
             progress.on_frame();
         }
-        polled.map_ok(|frame| frame.map_data(|bytes| outbox.attach(bytes, || UnreadGuard::new(progress))))
+        polled.map_ok(|frame| frame.map_data(|bytes| pending_reservations.attach(bytes, || UnreadGuard::new(progress))))
     }
 
     fn is_end_stream(&self) -> bool {

@@ -51,7 +51,7 @@ impl<'a, 'input> ModelText<'a, 'input> {
     }
 
     /// Whether a geom is a mesh that affects only pictures: it cannot touch anything, and adds no mass to its body.
-    pub(super) fn is_shown_only(self, geom: Node<'a, 'input>) -> bool {
+    pub(super) fn affects_only_pictures(self, geom: Node<'a, 'input>) -> bool {
         let is_zero = |key| self.get(geom, key).unwrap_or("1").trim() == "0";
         let is_mesh = self.get(geom, "type") == Some("mesh") && self.get(geom, "mesh").is_some();
         let has_inertia = geom.parent_element().is_some_and(|body| self.inertial(body).is_some());
@@ -60,8 +60,8 @@ impl<'a, 'input> ModelText<'a, 'input> {
 
     /// Whether the text for the physics can omit a geom. The geom must affect only pictures, and must have no name by
     /// which a task could refer to it.
-    pub(super) fn is_left_out(self, geom: Node<'a, 'input>) -> bool {
-        !geom.has_attribute("name") && self.is_shown_only(geom)
+    pub(super) fn is_omitted_from_physics(self, geom: Node<'a, 'input>) -> bool {
+        !geom.has_attribute("name") && self.affects_only_pictures(geom)
     }
 }
 
@@ -70,12 +70,12 @@ impl<'a, 'input> ModelText<'a, 'input> {
 ///
 /// # Errors
 /// [`super::Error`] if the text is not XML.
-pub(super) fn without_shown(text: &Text) -> Result<Text> {
+pub(super) fn without_visual_geoms(text: &Text) -> Result<Text> {
     let document = parse("the model", &text.xml)?;
     let attributes = ModelText { document: &document };
     let is_in_tree = |geom: &Node<'_, '_>| geom.ancestors().any(|ancestor| ancestor.has_tag_name("worldbody"));
     let (out, kept): (Vec<_>, Vec<_>) =
-        attributes.elements("geom").partition(|geom| is_in_tree(geom) && attributes.is_left_out(*geom));
+        attributes.elements("geom").partition(|geom| is_in_tree(geom) && attributes.is_omitted_from_physics(*geom));
     let meshes = kept.iter().filter_map(|geom| attributes.get(*geom, "mesh")).collect::<Vec<_>>();
     let is_used = |mesh: &Node<'_, '_>| mesh.attribute("name").is_none_or(|name| meshes.contains(&name));
     let unused = attributes.elements("mesh").filter(|mesh| !out.is_empty() && !is_used(mesh));

@@ -8,7 +8,7 @@ use crate::{
 };
 use perturb_mujoco::{Error, Simulation};
 
-/// Number of timesteps in each simulation that [`unseen`] compares.
+/// Number of timesteps in each simulation that [`parameters_without_effect`] compares.
 const N_STEPS: usize = 200;
 
 /// Returns the names of the parameters that change nothing in 200 timesteps with random controls from the initial
@@ -17,7 +17,7 @@ const N_STEPS: usize = 200;
 ///
 /// # Errors
 /// MuJoCo's fatal errors.
-pub(super) fn unseen(task: &'static FolderTask) -> Result<Vec<&'static str>, Error> {
+pub(super) fn parameters_without_effect(task: &'static FolderTask) -> Result<Vec<&'static str>, Error> {
     let defaults: Vec<f64> = task.spec.parameters.iter().map(|parameter| parameter.default).collect();
     let own = trajectory(task, &defaults)?;
     let mut unseen = Vec::new();

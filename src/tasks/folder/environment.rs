@@ -7,7 +7,7 @@ use super::{
     reading::Reading,
     reset::InitialStateDistribution,
     reward::{StepValues, Term},
-    rules::{Best, Goal, Range},
+    rules::{Aggregate, Goal, Range},
     template::{ModelEdit, Template},
 };
 use crate::{
@@ -208,8 +208,8 @@ impl FolderEnvironment {
             reading.read(simulation, context, numbers);
             let now = numbers.drain(n..).next().unwrap_or(f64::NAN);
             match best {
-                Best::Greatest if !is_first => self.achieved.max(now),
-                Best::Least if !is_first => self.achieved.min(now),
+                Aggregate::Greatest if !is_first => self.achieved.max(now),
+                Aggregate::Least if !is_first => self.achieved.min(now),
                 _ => now,
             }
         });

@@ -85,8 +85,8 @@ pub(super) fn read(files: &mut Files) -> Result<FolderTask> {
     // Geoms that affect only pictures are removed, unless the file refers to elements by index (`#3`), because removing
     // geoms changes indices.
     if edits_lengths(&top) && !text.contains("\"#") && !text.contains("'#") {
-        mjcf.physics = attributes::without_shown(&mjcf.physics)?;
-        mjcf.leaves_out = true;
+        mjcf.physics = attributes::without_visual_geoms(&mjcf.physics)?;
+        mjcf.lacks_visual_geoms = true;
     }
     let model = compile(&mjcf, main)?;
     assemble(&top, about, (mjcf, model, main), files.hash())

@@ -132,7 +132,7 @@ impl Files {
     }
 
     /// Like [`Files::are_unchanged`], but reads only files whose modification time has changed.
-    pub(super) fn look_unchanged(&self) -> bool {
+    pub(super) fn have_unchanged_times(&self) -> bool {
         let is_as_old = |name: &str, file: &FileContent| {
             let modified = self.root.join(name).metadata().and_then(|about| about.modified()).ok();
             modified.is_some() && modified == file.modified

@@ -18,9 +18,9 @@ use roxmltree::Node;
 use std::collections::BTreeMap;
 
 /// A length, size, radius or position of the model that a parameter edits. After such an edit the model must be
-/// compiled again. In this module, a slot is such an edited quantity, and not an environment's position in a batch.
+/// compiled again.
 #[derive(Debug)]
-pub(super) struct Slot {
+pub(super) struct EditedLength {
     /// The index of the parameter.
     pub(super) parameter: usize,
     edit: ParameterEdit,
@@ -29,22 +29,24 @@ pub(super) struct Slot {
     own: f64,
 }
 
-impl Slot {
-    /// Collects the slots of all parameters: one [`Slot`] for each target that requires a new compilation.
+impl EditedLength {
+    /// Collects the edited lengths of all parameters: one [`EditedLength`] for each target that requires a new
+    /// compilation.
     pub(super) fn all(parameters: &[EditedParameter], model: &Model) -> Vec<Self> {
-        let mut slots = Vec::new();
+        let mut edited_lengths = Vec::new();
         for (parameter, edited) in parameters.iter().enumerate() {
             for edit in &edited.edits {
                 let targets = edit.targets.all.iter().filter(|target| target.is_recompiled());
-                let slot = |&target: &Target| Self { parameter, edit: edit.clone(), target, own: target.value(model) };
-                slots.extend(targets.map(slot));
+                let edited_length =
+                    |&target: &Target| Self { parameter, edit: edit.clone(), target, own: target.value(model) };
+                edited_lengths.extend(targets.map(edited_length));
             }
         }
-        slots
+        edited_lengths
     }
 
-    /// Returns by how much the slot changes with these parameter values: a factor for a length, size or radius, a shift
-    /// in m for a position.
+    /// Returns by how much the edited length changes with these parameter values: a factor for a length, size or
+    /// radius, a shift in m for a position.
     pub(super) fn amount(&self, values: &[f64]) -> f64 {
         let value = values[self.parameter];
         match self.target {
@@ -60,23 +62,24 @@ impl Slot {
     }
 }
 
-/// A summand of a number in the text. If `slot` is `None`, the summand is `coefficient`. Otherwise `slot` is the index
-/// of a [`Slot`], and the summand is `coefficient` times [`Slot::amount`]. The amount is squared if `squared`.
+/// A summand of a number in the text. If `edited_length` is `None`, the summand is `coefficient`. Otherwise
+/// `edited_length` is the index of an [`EditedLength`], and the summand is `coefficient` times
+/// [`EditedLength::amount`]. The amount is squared if `squared`.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
-    slot: Option<usize>,
+    edited_length: Option<usize>,
     squared: bool,
 }
 
 impl Summand {
-    fn new(coefficient: f64, slot: Option<usize>) -> Self {
-        Self { coefficient, slot, squared: false }
+    fn new(coefficient: f64, edited_length: Option<usize>) -> Self {
+        Self { coefficient, edited_length, squared: false }
     }
 }
 
-/// A number in the text: the sum of its parts. If the amounts of all slots in the parts are neutral, the number is
-/// exactly `own`, without rounding errors of the sum.
+/// A number in the text: the sum of its parts. If the amounts of all edited lengths in the parts are neutral, the
+/// number is exactly `own`, without rounding errors of the sum.
 #[derive(Debug)]
 struct EditedNumber {
     own: f64,
@@ -84,12 +87,16 @@ struct EditedNumber {
 }
 
 impl EditedNumber {
-    fn value(&self, slots: &[Slot], amounts: &[f64]) -> f64 {
-        let changes = |slot: usize| amounts[slot].to_bits() != slots[slot].neutral().to_bits();
-        if !self.parts.iter().filter_map(|part| part.slot).any(changes) {
+    fn value(&self, edited_lengths: &[EditedLength], amounts: &[f64]) -> f64 {
+        let changes = |edited_length: usize| {
+            amounts[edited_length].to_bits() != edited_lengths[edited_length].neutral().to_bits()
+        };
+        if !self.parts.iter().filter_map(|part| part.edited_length).any(changes) {
             return self.own;
         }
-        let value = |&Summand { coefficient, slot, squared }: &Summand| match slot.map(|slot| amounts[slot]) {
+        let value = |&Summand { coefficient, edited_length, squared }: &Summand| match edited_length
+            .map(|edited_length| amounts[edited_length])
+        {
             None => coefficient,
             Some(amount) if squared => coefficient * (amount * amount),
             Some(amount) => coefficient * amount,
@@ -109,31 +116,31 @@ enum Piece {
     Element(String, Vec<Attribute>, &'static str),
 }
 
-/// A model's text whose numbers depend on the amount of each [`Slot`].
+/// A model's text whose numbers depend on the amount of each [`EditedLength`].
 #[derive(Debug)]
 pub(super) struct EditedText {
     pieces: Vec<Piece>,
 }
 
 impl EditedText {
-    /// Finds the numbers in a text that the slots change. `leaves_out` says whether `model` lacks the geoms that affect
-    /// only pictures. `refuse` creates an error from the index of a slot and a reason.
+    /// Finds the numbers in a text that the edited lengths change. `lacks_visual_geoms` says whether `model` lacks the
+    /// geoms that affect only pictures. `refuse` creates an error from the index of an edited length and a reason.
     ///
     /// # Errors
     /// An error of `refuse` if an element does not have the edited length, or cannot follow the edit.
     pub(super) fn new(
         text: &Text,
         model: &Model,
-        slots: &[Slot],
-        leaves_out: bool,
+        edited_lengths: &[EditedLength],
+        lacks_visual_geoms: bool,
         refuse: &dyn Fn(usize, &str) -> super::error::Error,
     ) -> Result<Self> {
         let document = parse("the model", &text.xml)?;
         let mut editor = Editor {
             attributes: ModelText { document: &document },
             model,
-            slots,
-            leaves_out,
+            edited_lengths,
+            lacks_visual_geoms,
             refuse,
             edited: BTreeMap::new(),
         };
@@ -156,8 +163,8 @@ impl EditedText {
         Ok(Self { pieces })
     }
 
-    /// Returns the text with the numbers that follow from `amounts`, the amount of each slot.
-    pub(super) fn write(&self, slots: &[Slot], amounts: &[f64]) -> String {
+    /// Returns the text with the numbers that follow from `amounts`, the amount of each edited length.
+    pub(super) fn write(&self, edited_lengths: &[EditedLength], amounts: &[f64]) -> String {
         let mut text = String::new();
         for piece in &self.pieces {
             match piece {
@@ -165,7 +172,7 @@ impl EditedText {
                 Piece::Element(head, attributes, end) => {
                     text.push_str(head);
                     for (key, numbers) in attributes {
-                        let numbers = numbers.iter().map(|number| number.value(slots, amounts).to_string());
+                        let numbers = numbers.iter().map(|number| number.value(edited_lengths, amounts).to_string());
                         write_attribute(&mut text, key, &numbers.collect::<Vec<_>>().join(" "));
                     }
                     text.push_str(end);
@@ -176,12 +183,12 @@ impl EditedText {
     }
 }
 
-/// The [`Slot`] that scales a body, by its index.
+/// The [`EditedLength`] that scales a body, by its index.
 #[derive(Clone, Copy, Default)]
 struct Scaling {
-    /// The index of the [`Slot`] that scales positions and lengths.
+    /// The index of the [`EditedLength`] that scales positions and lengths.
     along: Option<usize>,
-    /// The index of the same [`Slot`] if it also scales everything else, such as radii.
+    /// The index of the same [`EditedLength`] if it also scales everything else, such as radii.
     size: Option<usize>,
 }
 
@@ -189,9 +196,9 @@ struct Scaling {
 struct Editor<'a, 'input> {
     attributes: ModelText<'a, 'input>,
     model: &'a Model,
-    slots: &'a [Slot],
+    edited_lengths: &'a [EditedLength],
     /// Whether `model` lacks the geoms that affect only pictures.
-    leaves_out: bool,
+    lacks_visual_geoms: bool,
     refuse: &'a dyn Fn(usize, &str) -> super::error::Error,
     /// The edited elements by their line in the text: the element's start without the edited attributes, and the edited
     /// attributes.
@@ -225,19 +232,19 @@ impl<'a, 'input> Editor<'a, 'input> {
         Ok(())
     }
 
-    /// Finds the [`Slot`] that scales a body. Returns an error if two slots scale the body.
+    /// Finds the [`EditedLength`] that scales a body. Returns an error if two edited lengths scale the body.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
-        for (slot, Slot { target, .. }) in self.slots.iter().enumerate() {
+        for (edited_length, EditedLength { target, .. }) in self.edited_lengths.iter().enumerate() {
             let size = match *target {
                 Target::Length(of, _) if of == body => None,
-                Target::Size(of, _) if of == body => Some(slot),
+                Target::Size(of, _) if of == body => Some(edited_length),
                 _ => continue,
             };
             if scaling.along.is_some() {
-                return Err((self.refuse)(slot, "another edit scales this body, too; let one edit do it"));
+                return Err((self.refuse)(edited_length, "another edit scales this body, too; let one edit do it"));
             }
-            scaling = Scaling { along: Some(slot), size };
+            scaling = Scaling { along: Some(edited_length), size };
         }
         Ok(scaling)
     }
@@ -248,10 +255,10 @@ impl<'a, 'input> Editor<'a, 'input> {
         for constraint in self.attributes.elements("connect").chain(self.attributes.elements("weld")) {
             for name in ["body1", "body2"].into_iter().filter_map(|key| constraint.attribute(key)) {
                 let found = bodies.iter().position(|node| node.attribute("name") == Some(name));
-                if let Some(slot) = found.and_then(|i| scalings[i + 1].along) {
+                if let Some(edited_length) = found.and_then(|i| scalings[i + 1].along) {
                     let problem =
                         format!("an equality constraint names body {name:?}, and its anchor would not follow");
-                    return Err((self.refuse)(slot, &problem));
+                    return Err((self.refuse)(edited_length, &problem));
                 }
             }
         }
@@ -265,8 +272,8 @@ impl<'a, 'input> Editor<'a, 'input> {
         let (carried, own) = (scalings[parent].along, scalings[body].along);
         let shift = |axis: usize| {
             let shifts =
-                |slot: &Slot| matches!(slot.target, Target::Position(of, along) if (of, along) == (body, axis));
-            self.slots.iter().position(shifts)
+                |it: &EditedLength| matches!(it.target, Target::Position(of, along) if (of, along) == (body, axis));
+            self.edited_lengths.iter().position(shifts)
         };
         let shifts: [Option<usize>; 3] = std::array::from_fn(shift);
         let anchor = attachment(self.model, body);
@@ -275,16 +282,16 @@ impl<'a, 'input> Editor<'a, 'input> {
         if carried.is_none() && own.is_none() && shifts == [None; 3] {
             return Ok(());
         }
-        if let Some(slot) = shifts.into_iter().flatten().next()
+        if let Some(edited_length) = shifts.into_iter().flatten().next()
             && (carried.is_some() || own.is_some())
         {
             let problem = "a length moves this body, too; edit one of both";
-            return Err((self.refuse)(slot, problem));
+            return Err((self.refuse)(edited_length, problem));
         }
         let position = self.numbers(node, "pos", &[0.0; 3])?;
         let number = |axis: usize| {
             let mut parts = vec![Summand::new(position[axis] + anchor[axis], carried)];
-            parts.extend(shifts[axis].map(|slot| Summand::new(1.0, Some(slot))));
+            parts.extend(shifts[axis].map(|edited_length| Summand::new(1.0, Some(edited_length))));
             if anchor[axis] != 0.0 {
                 parts.push(Summand::new(-anchor[axis], own));
             }
@@ -299,7 +306,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         let inertial = self.attributes.inertial(node);
         for child in node.children().filter(Node::is_element) {
             match child.tag_name().name() {
-                "geom" if self.attributes.is_left_out(child) && self.leaves_out => {
+                "geom" if self.attributes.is_omitted_from_physics(child) && self.lacks_visual_geoms => {
                     self.scale(child, "pos", &[], scaling.along)?;
                 }
                 "geom" => {
@@ -317,16 +324,16 @@ impl<'a, 'input> Editor<'a, 'input> {
             }
         }
         // At constant mass, the inertia that an `<inertial>` element states grows with the square of the size.
-        let (Some(inertial), Some(slot)) = (inertial, scaling.along) else { return Ok(()) };
+        let (Some(inertial), Some(edited_length)) = (inertial, scaling.along) else { return Ok(()) };
         if scaling.size.is_none() {
             let problem =
                 "the body has <inertial>, whose moments do not follow a length; leave it out, or use field = \"size\"";
-            return Err((self.refuse)(slot, problem));
+            return Err((self.refuse)(edited_length, problem));
         }
         self.scale(inertial, "pos", &[], scaling.along)?;
         for key in ["diaginertia", "fullinertia"] {
             let own = self.numbers(inertial, key, &[])?;
-            let part = |coefficient: f64| Summand { coefficient, slot: scaling.size, squared: true };
+            let part = |coefficient: f64| Summand { coefficient, edited_length: scaling.size, squared: true };
             let number = |&own: &f64| EditedNumber { own, parts: vec![part(own)] };
             self.set(inertial, key, own.iter().map(number).collect());
         }
@@ -346,24 +353,28 @@ impl<'a, 'input> Editor<'a, 'input> {
         Scaling { along, size }: Scaling,
         has_inertial: bool,
     ) -> Result<()> {
-        let radius = |slot: &Slot| matches!(slot.target, Target::Radius(of) if Some(of) == geom);
-        let radius = self.slots.iter().position(radius);
-        if let (Some(_), Some(slot)) = (radius, size) {
-            return Err((self.refuse)(slot, "another edit sets the radius of one of its geoms, too; edit one of both"));
+        let radius =
+            |edited_length: &EditedLength| matches!(edited_length.target, Target::Radius(of) if Some(of) == geom);
+        let radius = self.edited_lengths.iter().position(radius);
+        if let (Some(_), Some(edited_length)) = (radius, size) {
+            return Err((self.refuse)(
+                edited_length,
+                "another edit sets the radius of one of its geoms, too; edit one of both",
+            ));
         }
-        let Some(slot) = along.or(radius) else { return Ok(()) };
+        let Some(edited_length) = along.or(radius) else { return Ok(()) };
         // An edit that affects neither contacts nor the inertia is refused.
         let kind = self.attributes.get(node, "type").unwrap_or("sphere");
         let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
         if none && !touches {
             let problem =
                 "it has no effect: one of its geoms can touch nothing, and its body has an <inertial> of its own";
-            return Err((self.refuse)(slot, problem));
+            return Err((self.refuse)(edited_length, problem));
         }
         if self.attributes.get(node, "mesh").is_some() || matches!(kind, "mesh" | "hfield" | "plane") {
-            if !self.attributes.is_shown_only(node) {
+            if !self.attributes.affects_only_pictures(node) {
                 let problem = "a mesh, a height field or a plane cannot be scaled, and one of its geoms is one";
-                return Err((self.refuse)(slot, problem));
+                return Err((self.refuse)(edited_length, problem));
             }
             return self.scale(node, "pos", &[], along);
         }
@@ -377,14 +388,15 @@ impl<'a, 'input> Editor<'a, 'input> {
             "capsule" | "cylinder" => self.scale(node, "size", &[wide, along], None),
             _ if size.is_none() => {
                 let problem = format!("the body has a {kind}, which has no length; use field = \"size\"");
-                Err((self.refuse)(slot, &problem))
+                Err((self.refuse)(edited_length, &problem))
             }
             _ => self.scale(node, "size", &[], size),
         }
     }
 
-    /// Scales the numbers of an attribute. `first` and `rest` are indices of [`Slot`]s. The [`Slot`] `first[i]` scales
-    /// number i. The [`Slot`] `rest` scales the numbers beyond the end of `first`. `None` leaves a number unchanged.
+    /// Scales the numbers of an attribute. `first` and `rest` are indices of [`EditedLength`]s. The [`EditedLength`]
+    /// `first[i]` scales number i. The [`EditedLength`] `rest` scales the numbers beyond the end of `first`. `None`
+    /// leaves a number unchanged.
     fn scale(
         &mut self,
         node: Node<'a, 'input>,
@@ -392,12 +404,12 @@ impl<'a, 'input> Editor<'a, 'input> {
         first: &[Option<usize>],
         rest: Option<usize>,
     ) -> Result<()> {
-        let slot = |i: usize| first.get(i).copied().unwrap_or(rest);
+        let edited_length = |i: usize| first.get(i).copied().unwrap_or(rest);
         let own = self.numbers(node, key, &[])?;
-        if (0..own.len()).all(|i| slot(i).is_none() || own[i] == 0.0) {
+        if (0..own.len()).all(|i| edited_length(i).is_none() || own[i] == 0.0) {
             return Ok(());
         }
-        let number = |(i, &own): (usize, &f64)| EditedNumber { own, parts: vec![Summand::new(own, slot(i))] };
+        let number = |(i, &own): (usize, &f64)| EditedNumber { own, parts: vec![Summand::new(own, edited_length(i))] };
         self.set(node, key, own.iter().enumerate().map(number).collect());
         Ok(())
     }

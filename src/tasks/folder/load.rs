@@ -28,7 +28,7 @@ impl TaskFolder {
 
     /// Whether the files on the disk still have the loaded contents.
     pub fn is_unchanged(&self) -> bool {
-        self.files.look_unchanged()
+        self.files.have_unchanged_times()
     }
 }
 

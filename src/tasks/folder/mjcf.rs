@@ -39,7 +39,7 @@ pub(super) struct Mjcf {
     /// Whether the model has `settotalmass`, which scales all masses to a total.
     pub(super) has_total_mass: bool,
     /// Whether the text for the physics lacks the geoms that affect only pictures.
-    pub(super) leaves_out: bool,
+    pub(super) lacks_visual_geoms: bool,
 }
 
 /// An MJCF text with one element per line, and the files to which it refers.
@@ -102,10 +102,10 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     let documents = sources.iter().map(|(name, text)| parse(name, text)).collect::<Result<Vec<_>>>()?;
     let root = documents[0].root_element();
     check_root(&sources[0].0, &root)?;
-    let parts: Vec<Part<'_>> = sources
+    let parts: Vec<SourceFile<'_>> = sources
         .iter()
         .zip(&documents)
-        .map(|((name, text), document)| Part { name, document, line_ends: line_ends(text) })
+        .map(|((name, text), document)| SourceFile { name, document, line_ends: line_ends(text) })
         .collect();
     let folders = Folders::find(&parts);
     let attributes = |element: &str| {
@@ -126,10 +126,10 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     };
     writer.physics.sources = parts.iter().map(|part| part.name.to_owned()).collect();
     writer.picture.sources.clone_from(&writer.physics.sources);
-    writer.element(0, root, Kept::Both, 0)?;
+    writer.element(0, root, TextTarget::Both, 0)?;
     let Writer { physics, picture, .. } = writer;
     let has_total_mass = compiler.iter().any(|name| name == "settotalmass");
-    Ok(Mjcf { physics, picture, statistic, has_total_mass, leaves_out: false })
+    Ok(Mjcf { physics, picture, statistic, has_total_mass, lacks_visual_geoms: false })
 }
 
 /// Reads a model file and all files that it includes, and appends their names and texts to `sources`. `who` is the name
@@ -201,14 +201,14 @@ fn check_composite(name: &str, node: &Node<'_, '_>) -> Result<()> {
 }
 
 /// A parsed file of the model.
-struct Part<'a> {
+struct SourceFile<'a> {
     name: &'a str,
     document: &'a Document<'a>,
     /// The byte offsets of the line ends.
     line_ends: Vec<usize>,
 }
 
-impl Part<'_> {
+impl SourceFile<'_> {
     /// Returns the line of an element, counted from 1.
     fn line(&self, node: &Node<'_, '_>) -> u32 {
         1 + self.line_ends.partition_point(|&end| end < node.range().start) as u32
@@ -229,7 +229,7 @@ struct Folders {
 }
 
 impl Folders {
-    fn find(parts: &[Part<'_>]) -> Self {
+    fn find(parts: &[SourceFile<'_>]) -> Self {
         let mut folders = Self::default();
         let elements = parts.iter().flat_map(|part| part.document.descendants());
         for compiler in elements.filter(|node| node.has_tag_name("compiler")) {
@@ -260,7 +260,7 @@ impl Folders {
 
 /// The texts that an element is written to.
 #[derive(Clone, Copy, PartialEq)]
-enum Kept {
+enum TextTarget {
     Both,
     PictureOnly,
 }
@@ -268,7 +268,7 @@ enum Kept {
 /// Writes the text for the physics and the text for pictures.
 struct Writer<'a> {
     files: &'a mut Files,
-    parts: &'a [Part<'a>],
+    parts: &'a [SourceFile<'a>],
     folders: Folders,
     physics: Text,
     picture: Text,
@@ -279,26 +279,26 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    fn element(&mut self, part: usize, node: Node<'_, '_>, kept: Kept, depth: usize) -> Result<()> {
+    fn element(&mut self, part: usize, node: Node<'_, '_>, target: TextTarget, depth: usize) -> Result<()> {
         let (name, tag) = (self.parts[part].name, node.tag_name().name());
         if depth > MAX_DEPTH {
             return Err(at(name, &node, format_args!("elements are nested more than {MAX_DEPTH} deep")));
         }
         if tag == "include" {
-            return self.include(node, kept, depth);
+            return self.include(node, target, depth);
         }
         if tag == "composite" {
             check_composite(name, &node)?;
         }
-        let kept = if is_visual(&node) { Kept::PictureOnly } else { kept };
+        let target = if is_visual(&node) { TextTarget::PictureOnly } else { target };
         let (mut physics, mut picture) = (format!("<{tag}"), format!("<{tag}"));
         for attribute in node.attributes() {
             let key = attribute.name();
             if tag == "compiler" && ["meshdir", "texturedir", "strippath"].contains(&key) {
                 continue;
             }
-            let (value, picture_value) = match names_file(tag, key) {
-                Some(needed) => self.file(part, &node, attribute.value(), needed && kept == Kept::Both)?,
+            let (value, picture_value) = match file_reference(tag, key) {
+                Some(needed) => self.file(part, &node, attribute.value(), needed && target == TextTarget::Both)?,
                 None => (attribute.value().to_owned(), attribute.value().to_owned()),
             };
             if key != "material" {
@@ -308,7 +308,7 @@ impl Writer<'_> {
         }
         // MuJoCo names an element without a name after its file. The text refers to files by new names, so the
         // element's original name is added.
-        if let Some(file) = node.attribute("file").filter(|_| names_file(tag, "file").is_some())
+        if let Some(file) = node.attribute("file").filter(|_| file_reference(tag, "file").is_some())
             && !node.has_attribute("name")
             && !in_defaults(&node)
         {
@@ -320,15 +320,15 @@ impl Writer<'_> {
         let place = (part, self.parts[part].line(&node));
         let children: Vec<Node<'_, '_>> = node.children().filter(Node::is_element).collect();
         let end = if children.is_empty() { "/>" } else { ">" };
-        if kept == Kept::Both {
+        if target == TextTarget::Both {
             self.physics.push(&format!("{physics}{end}"), place);
         }
         self.picture.push(&format!("{picture}{end}"), place);
         for &child in &children {
-            self.element(part, child, kept, depth + 1)?;
+            self.element(part, child, target, depth + 1)?;
         }
         if !children.is_empty() {
-            if kept == Kept::Both {
+            if target == TextTarget::Both {
                 self.physics.push(&format!("</{tag}>"), place);
             }
             self.picture.push(&format!("</{tag}>"), place);
@@ -337,12 +337,12 @@ impl Writer<'_> {
     }
 
     /// Writes the elements of an included file instead of the `<include>` element.
-    fn include(&mut self, node: Node<'_, '_>, kept: Kept, depth: usize) -> Result<()> {
+    fn include(&mut self, node: Node<'_, '_>, target: TextTarget, depth: usize) -> Result<()> {
         let file = node.attribute("file").unwrap_or_default().replace('\\', "/");
         let parts = self.parts;
         let Some(part) = parts.iter().position(|part| part.name == file) else { return Ok(()) };
         for child in parts[part].document.root_element().children().filter(Node::is_element) {
-            self.element(part, child, kept, depth + 1)?;
+            self.element(part, child, target, depth + 1)?;
         }
         Ok(())
     }
@@ -363,7 +363,7 @@ impl Writer<'_> {
 
 /// Returns whether the physics needs the file to which an attribute refers; `None` if the attribute does not refer to a
 /// file.
-fn names_file(tag: &str, key: &str) -> Option<bool> {
+fn file_reference(tag: &str, key: &str) -> Option<bool> {
     FILE_ATTRIBUTES.iter().find(|(element, keys, _)| *element == tag && keys.contains(&key)).map(|entry| entry.2)
 }
 

@@ -2,7 +2,7 @@
 
 use super::{
     error::Result,
-    lengths::{EditedText, Slot},
+    lengths::{EditedLength, EditedText},
     mjcf::{Mjcf, escaped_reason},
     parameter::EditedParameter,
     table::TomlTable,
@@ -24,7 +24,7 @@ const MAX_CACHED: usize = 1024;
 /// The texts of a model whose lengths can be edited, and a cache of compiled models.
 #[derive(Debug)]
 pub(super) struct Recompilation {
-    slots: Vec<Slot>,
+    edited_lengths: Vec<EditedLength>,
     physics: EditedText,
     picture: EditedText,
     files: Vec<(String, Vec<u8>)>,
@@ -33,7 +33,7 @@ pub(super) struct Recompilation {
 
 #[derive(Debug, Default)]
 struct CompiledModels {
-    /// The compiled models. The key has the bits of [`Slot::amount`] for each slot.
+    /// The compiled models. The key has the bits of [`EditedLength::amount`] for each edited length.
     models: HashMap<Box<[u64]>, Arc<Model>>,
     /// The keys of `models`, oldest first.
     order: VecDeque<Box<[u64]>>,
@@ -51,12 +51,12 @@ impl Recompilation {
         mjcf: &Mjcf,
         model: &Model,
     ) -> Result<Option<Self>> {
-        let slots = Slot::all(parameters, model);
+        let edited_lengths = EditedLength::all(parameters, model);
         let error = |parameter: usize, problem: String| {
             let name = parameters[parameter].parameter.name;
             tables[parameter].clone().at(format!("parameter {name}")).error(problem)
         };
-        let Some(first) = slots.first() else { return Ok(None) };
+        let Some(first) = edited_lengths.first() else { return Ok(None) };
         if model.model_bytes() > MAX_MODEL_BYTES {
             let (own, most) = (model.model_bytes() / 1000, MAX_MODEL_BYTES / 1000);
             return Err(error(
@@ -64,14 +64,15 @@ impl Recompilation {
                 format!("the model takes {own} kB, and each environment would have its own; the limit is {most} kB"),
             ));
         }
-        let refuse = |slot: usize, problem: &str| error(slots[slot].parameter, problem.to_owned());
-        let physics = EditedText::new(&mjcf.physics, model, &slots, mjcf.leaves_out, &refuse)?;
-        let picture = EditedText::new(&mjcf.picture, model, &slots, mjcf.leaves_out, &refuse)?;
-        let own = Self { slots, physics, picture, files: mjcf.physics.files.clone(), cache: Mutex::default() };
+        let refuse =
+            |edited_length: usize, problem: &str| error(edited_lengths[edited_length].parameter, problem.to_owned());
+        let physics = EditedText::new(&mjcf.physics, model, &edited_lengths, mjcf.lacks_visual_geoms, &refuse)?;
+        let picture = EditedText::new(&mjcf.picture, model, &edited_lengths, mjcf.lacks_visual_geoms, &refuse)?;
+        let own = Self { edited_lengths, physics, picture, files: mjcf.physics.files.clone(), cache: Mutex::default() };
         // The model is compiled with extreme values, so that impossible lengths are found when the folder is loaded.
         let defaults: Vec<f64> = parameters.iter().map(|edited| edited.parameter.default).collect();
         for (i, parameter) in parameters.iter().map(|edited| &edited.parameter).enumerate() {
-            if own.slots.iter().all(|slot| slot.parameter != i) {
+            if own.edited_lengths.iter().all(|edited_length| edited_length.parameter != i) {
                 continue;
             }
             let [below, above] = parameter.extreme;
@@ -95,16 +96,19 @@ impl Recompilation {
         &'a self,
         parameters: &'a [EditedParameter],
     ) -> impl Iterator<Item = &'static str> + 'a {
-        let is_own = |i: usize| self.slots.iter().any(|slot| slot.parameter == i);
+        let is_own = |i: usize| self.edited_lengths.iter().any(|edited_length| edited_length.parameter == i);
         parameters.iter().enumerate().filter(move |(i, _)| is_own(*i)).map(|(_, edited)| edited.parameter.name)
     }
 
     fn amounts(&self, values: &[f64]) -> Vec<f64> {
-        self.slots.iter().map(|slot| slot.amount(values)).collect()
+        self.edited_lengths.iter().map(|edited_length| edited_length.amount(values)).collect()
     }
 
     fn is_neutral(&self, amounts: &[f64]) -> bool {
-        self.slots.iter().zip(amounts).all(|(slot, amount)| amount.to_bits() == slot.neutral().to_bits())
+        self.edited_lengths
+            .iter()
+            .zip(amounts)
+            .all(|(edited_length, amount)| amount.to_bits() == edited_length.neutral().to_bits())
     }
 
     /// Returns the model with the lengths that the parameters `values` give, from the cache if possible. If no length
@@ -140,13 +144,13 @@ impl Recompilation {
     /// from the unedited model.
     pub(super) fn picture(&self, values: &[f64]) -> Option<String> {
         let amounts = self.amounts(values);
-        (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.slots, &amounts))
+        (!self.is_neutral(&amounts)).then(|| self.picture.write(&self.edited_lengths, &amounts))
     }
 
     fn compile(&self, own: &Model, amounts: &[f64]) -> std::result::Result<Model, Error> {
         let files: Vec<(&str, &[u8])> =
             self.files.iter().map(|(name, bytes)| (name.as_str(), bytes.as_slice())).collect();
-        let model = Model::from_files(&self.physics.write(&self.slots, amounts), &files)?;
+        let model = Model::from_files(&self.physics.write(&self.edited_lengths, amounts), &files)?;
         if model.has_sizes_of(own) {
             return Ok(model);
         }

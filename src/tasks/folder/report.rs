@@ -28,7 +28,7 @@ impl TaskFolder {
     /// # Errors
     /// [`Error`] if MuJoCo raises a fatal error.
     pub fn parameters_without_effect(&self) -> Result<Vec<&'static str>, Error> {
-        effect::unseen(self.task).map_err(Error::folder)
+        effect::parameters_without_effect(self.task).map_err(Error::folder)
     }
 }
 

@@ -90,7 +90,7 @@ impl Range {
 
 /// The rule by which a reading's values after each step give the value that the episode achieved.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Best {
+pub(super) enum Aggregate {
     Greatest,
     Least,
     Last,
@@ -100,7 +100,7 @@ pub(super) enum Best {
 #[derive(Debug, Clone)]
 pub(super) struct Goal {
     /// The reading whose value the rule compares; `None` if the rule counts steps.
-    pub(super) achieved: Option<(Best, Reading)>,
+    pub(super) achieved: Option<(Aggregate, Reading)>,
     /// The conditions of the goal, if the rule counts steps at which the goal is met; otherwise empty.
     pub(super) ranges: Vec<Range>,
     pub(super) rule: SuccessRuleSpec,
@@ -156,9 +156,9 @@ impl Goal {
                     unit: table.text("unit")?.map_or(entry.unit, |unit| leaked(unit)),
                 };
                 let best = match key {
-                    "greatest" => Best::Greatest,
-                    "least" => Best::Least,
-                    _ => Best::Last,
+                    "greatest" => Aggregate::Greatest,
+                    "least" => Aggregate::Least,
+                    _ => Aggregate::Last,
                 };
                 goal.achieved = Some((best, reading));
                 Achievement::Own(quantity)

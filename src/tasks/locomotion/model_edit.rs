@@ -60,7 +60,7 @@ impl RobotEdit {
     }
 
     /// Whether this is the edit for these parameters.
-    pub(super) fn is_of(&self, density: f64, friction: f64) -> bool {
+    pub(super) fn has_parameters(&self, density: f64, friction: f64) -> bool {
         (self.density, self.friction) == (density, friction)
     }
 }

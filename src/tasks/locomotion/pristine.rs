@@ -116,7 +116,7 @@ impl Pristine {
     pub(super) fn edit(&'static self, density: f64, friction: f64) -> Result<Arc<RobotEdit>, Error> {
         shared::with(self, |shared| {
             shared.edit(
-                |edit| edit.is_of(density, friction),
+                |edit| edit.has_parameters(density, friction),
                 |own, simulation| RobotEdit::new(own.targets, &own.constants, simulation, density, friction),
             )
         })
@@ -131,7 +131,7 @@ impl SharedModel for Pristine {
     }
 
     fn is_same(a: &RobotEdit, b: &RobotEdit) -> bool {
-        a.is_of(b.density, b.friction)
+        a.has_parameters(b.density, b.friction)
     }
 
     fn write(&self, simulation: &mut Simulation, _: Option<&RobotEdit>, edit: &RobotEdit) -> Result<(), Error> {

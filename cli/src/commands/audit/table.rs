@@ -130,7 +130,7 @@ impl ChecksummedPolicy {
                 continue;
             }
             if recorded.is_none() {
-                recorded = Some(StudyEpisodes::read_if_there(&self.episodes)?.unwrap_or_default());
+                recorded = Some(StudyEpisodes::read_if_exists(&self.episodes)?.unwrap_or_default());
             }
             let first = recorded.as_ref().and_then(|all| all.first_difference(&self.name, name, replayed));
             let got = got.unwrap_or_else(|| "missing".into());

@@ -8,7 +8,7 @@ use perturb_records::comparison::{ComparedScore, TableCondition, compare_rows};
 use perturb_records::{ResultsTable, StudyPlan, TableError, TableRow};
 use perturb_report::EnvironmentComparison;
 
-use super::{Judged, default_name, split};
+use super::{ComparisonWithRule, default_name, split};
 use crate::commands::args::CompareArgs;
 use crate::commands::display::note;
 use crate::commands::error::{CommandError, Result};
@@ -17,7 +17,7 @@ use crate::commands::error::{CommandError, Result};
 type StudyTable = (ResultsTable, Option<String>);
 
 /// Compares rows of results tables. Returns `None` if no path of the conditions is a results table.
-pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Option<Judged>> {
+pub(super) fn comparison(args: &CompareArgs, score: ComparedScore) -> Result<Option<ComparisonWithRule>> {
     let mut others = 0;
     let mut conditions = Vec::new();
     for text in &args.conditions {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::Path;
 
-use perturb_files::read_if_there;
+use perturb_files::read_if_exists;
 use perturb_protocol::Version;
 use perturb_settings::sets::{Assignment, TestSet, set_of, set_of_csv};
 use perturb_settings::{ValueError, require};
@@ -82,7 +82,7 @@ pub(super) fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
     }
     let path = folder.join(file);
     let refused = |reason: &dyn std::fmt::Display| format!("`{}`, which cannot be read ({reason})", path.display());
-    match read_if_there(&path) {
+    match read_if_exists(&path) {
         Ok(content) => content.ok_or_else(|| refused(&std::io::Error::from(std::io::ErrorKind::NotFound))),
         Err(error) => Err(refused(&error.source)),
     }

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 
-use perturb_files::{AnyError, Stamp, is_locked, leads_out, list, read_toml};
+use perturb_files::{AnyError, Stamp, escapes_root, is_locked, list, read_toml};
 use perturb_records::statistics::mean;
 use perturb_text::{grouped, shortened};
 
@@ -197,7 +197,7 @@ impl CellStatus {
 fn read_plan(folder: &ExperimentFolder, within: Option<&Path>) -> Result<Plan, AnyError> {
     let path = folder.require_plan()?;
     if let Some(root) = within {
-        let out = |name: &Path| leads_out(root, folder.path(), name);
+        let out = |name: &Path| escapes_root(root, folder.path(), name);
         let tables =
             list(folder.path())?.into_iter().filter(|path| path.extension().is_some_and(|ending| ending == "csv"));
         let names =
@@ -226,7 +226,7 @@ fn read_plan(folder: &ExperimentFolder, within: Option<&Path>) -> Result<Plan, A
 /// Returns an error if the result or failure of a cell is behind a link that leads out of `root`.
 fn require_within(folder: &ExperimentFolder, cell: &Cell, root: &Path) -> Result<(), String> {
     let place = Path::new("cells").join(&cell.id);
-    let out = RECORDS.into_iter().find(|name| leads_out(root, folder.path(), place.join(name)));
+    let out = RECORDS.into_iter().find(|name| escapes_root(root, folder.path(), place.join(name)));
     out.map_or(Ok(()), |name| Err(format!("{} is {LEADS_OUT}", place.join(name).display())))
 }
 
@@ -282,7 +282,7 @@ mod tests {
         let folder = ExperimentFolder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         assert!(ExperimentStatus::read(directory.path()).is_err());
-        folder.keep_plan(&plan).unwrap();
+        folder.store_plan(&plan).unwrap();
         let mut status = ExperimentStatus::read(directory.path()).unwrap();
         assert_eq!((status.state(), &status.cells[0]), ("broken off", &CellStatus::Waiting { begun: false }));
 
@@ -336,7 +336,7 @@ mod tests {
         let root = directory.path().canonicalize().unwrap().join("root");
         let folder = ExperimentFolder::new(&root.join("study"));
         let plan = Plan::parse("test", PLAN.into()).unwrap();
-        folder.keep_plan(&plan).unwrap();
+        folder.store_plan(&plan).unwrap();
         let cell = folder.cell(&plan.cells[0].id);
         std::fs::create_dir_all(cell.path()).unwrap();
         std::os::unix::fs::symlink(&outside, cell.path().join("result.json")).unwrap();
@@ -362,7 +362,7 @@ mod tests {
         let directory = tempfile::tempdir().unwrap();
         let folder = ExperimentFolder::new(directory.path());
         let plan = Plan::parse("test", PLAN.into()).unwrap();
-        folder.keep_plan(&plan).unwrap();
+        folder.store_plan(&plan).unwrap();
         let (id, commit) = (plan.cells[0].id.clone(), "x".into());
         let failure = FailureRecord { id, reason: "long ".repeat(1000), commit, requires_restart: true };
         folder.cell(&failure.id).write_failure(&failure).unwrap();

@@ -15,7 +15,7 @@ pub use self::assessment::AssessmentStatus;
 pub use self::experiment::{CellStatus, ExperimentStatus, LEADS_OUT};
 pub use self::progress::{LastProgress, last_progress};
 pub use self::training::TrainingStatus;
-use perturb_files::{self as files, AnyError, leads_out};
+use perturb_files::{self as files, AnyError, escapes_root};
 use perturb_records::ExternalEvaluation;
 
 /// Maximum number of folders that are searched behind symbolic links, because a link may lead to a whole disk.
@@ -88,7 +88,7 @@ pub fn places(folder: &Path, most: usize, within: Option<&Path>) -> files::Resul
         let Some(path) = left.pop() else {
             let Some(link) = search.links.pop_front() else { break };
             let parent = link.parent().unwrap_or(folder);
-            match within.filter(|root| leads_out(root, parent, link.file_name().unwrap_or_default())) {
+            match within.filter(|root| escapes_root(root, parent, link.file_name().unwrap_or_default())) {
                 Some(_) => found.links_out.push(link),
                 None if search.followed == MAX_FOLDERS_BEHIND_LINKS => found.more = true,
                 None => {

@@ -87,7 +87,7 @@ pub enum CellEvent {
 impl CellEvent {
     /// Returns whether the event shows that the worker has started work on the cell. `Server` does not show this,
     /// because all cells of a group get their server at the start.
-    pub(super) fn is_a_turn(&self) -> bool {
+    pub(super) fn shows_work(&self) -> bool {
         !matches!(self, Self::Server { .. })
     }
 
@@ -179,7 +179,7 @@ pub(super) fn read_lines(file: &File, offset: &mut u64) -> std::io::Result<Vec<E
 }
 
 /// Returns the last non-empty line of `log` after byte `start`. It may contain the reason why a process ended.
-pub(super) fn last_words(log: &Path, start: u64) -> Option<String> {
+pub(super) fn last_log_line(log: &Path, start: u64) -> Option<String> {
     let (mut file, metadata) = open_plain(log).ok()?;
     let mut text = Vec::new();
     file.seek(SeekFrom::Start(start.max(metadata.len().saturating_sub(MAX_LAST_WORDS_BYTES)))).ok()?;

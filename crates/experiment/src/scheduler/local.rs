@@ -10,7 +10,7 @@ use std::time::Instant;
 use perturb_files::{FileError, create_folder, io, temporary_file};
 use perturb_protocol::spawn_failure;
 
-use super::event::{last_words, read_lines, write_line};
+use super::event::{last_log_line, read_lines, write_line};
 use super::{Backend, BackendEvent, CellEvent, JobCell, PendingCell, Result, WorkerJob};
 use crate::folder::ExperimentFolder;
 use crate::plan::{Grouping, Plan};
@@ -122,31 +122,31 @@ impl<'a> Local<'a> {
 
 impl Worker {
     /// Returns the worker's events since the last call, and whether the worker has ended.
-    fn news(&mut self) -> std::io::Result<(Vec<BackendEvent>, bool)> {
+    fn poll_events(&mut self) -> std::io::Result<(Vec<BackendEvent>, bool)> {
         let status = self.child.try_wait()?; // before reading its events, so that none is missed after its end
-        let mut news = Vec::new();
+        let mut events = Vec::new();
         for line in read_lines(&self.events, &mut self.offset)? {
             let Some(&cell) = self.cells.get(&line.cell) else { continue };
-            if line.event.is_a_turn() {
+            if line.event.shows_work() {
                 self.begun.insert(cell);
             }
             if line.event.is_last() {
                 self.cells.remove(&line.cell);
             }
-            news.push(BackendEvent::Event(cell, line.event));
+            events.push(BackendEvent::Event(cell, line.event));
         }
         if let Some(status) = status.filter(|_| !self.cells.is_empty()) {
-            let words = last_words(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
+            let words = last_log_line(&self.log, self.log_start).map_or_else(String::new, |words| format!(": {words}"));
             let reason = format!("its process ended with {status}{words}");
             let mut killed: Vec<usize> = std::mem::take(&mut self.cells).into_values().collect();
             killed.sort_unstable();
-            news.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
+            events.extend(killed.into_iter().map(|cell| match self.begun.is_empty() || self.begun.contains(&cell) {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: reason.clone() }),
                 // The process had not started this cell, so its end does not count as a failed attempt.
                 false => BackendEvent::Returned(cell),
             }));
         }
-        Ok((news, status.is_some()))
+        Ok((events, status.is_some()))
     }
 }
 
@@ -159,21 +159,21 @@ impl Backend for Local<'_> {
         true
     }
 
-    fn tells_ends(&self) -> bool {
+    fn reports_ends(&self) -> bool {
         true
     }
 
     fn poll(&mut self, _now: Instant) -> Result<Vec<BackendEvent>> {
-        let mut news = Vec::new();
+        let mut events = Vec::new();
         for mut worker in std::mem::take(&mut self.workers) {
-            let (said, ended) = worker.news().map_err(io("read what is told about", &worker.log))?;
-            news.extend(said);
+            let (said, ended) = worker.poll_events().map_err(io("read what is told about", &worker.log))?;
+            events.extend(said);
             if !ended {
                 self.workers.push(worker);
             }
         }
-        news.extend((self.server)());
-        Ok(news)
+        events.extend((self.server)());
+        Ok(events)
     }
 
     fn free_slots(&self) -> usize {

@@ -63,7 +63,7 @@ pub trait Backend {
     fn records_crashes_as_failures(&self) -> bool;
     /// Returns whether the backend reports the end of every started cell. If not, the scheduler looks for results in
     /// the folder.
-    fn tells_ends(&self) -> bool;
+    fn reports_ends(&self) -> bool;
     /// Returns the events since the last call.
     ///
     /// # Errors
@@ -337,8 +337,8 @@ impl<'a> Scheduler<'a> {
     /// Handles new events and starts the cells that can start. Returns the ids of the failed cells when all cells are
     /// settled, otherwise `None`.
     fn step(&mut self, now: Instant) -> Result<Option<Vec<String>>> {
-        for news in self.backend.poll(now)? {
-            match news {
+        for event in self.backend.poll(now)? {
+            match event {
                 BackendEvent::Note(sentence) => (self.report)(ProgressEvent::Note(&sentence)),
                 BackendEvent::NoServer(reason) => return Err(RunError::NoServer(reason)),
                 BackendEvent::Returned(cell) if self.settled(cell) => {}
@@ -493,7 +493,7 @@ impl<'a> Scheduler<'a> {
     /// waits for a new attempt.
     fn poll_results(&mut self, now: Instant) -> Result<()> {
         let begun = Instant::now();
-        let waits = self.backend.tells_ends();
+        let waits = self.backend.reports_ends();
         for cell in 0..self.cells.len() {
             let Tracked { phase, begun, .. } = self.cells[cell];
             // A worker of this run writes a result first and reports it later. So a cell of such a worker is skipped

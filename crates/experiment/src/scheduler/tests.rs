@@ -73,30 +73,30 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         CONVICTS
     }
 
-    fn tells_ends(&self) -> bool {
+    fn reports_ends(&self) -> bool {
         CONVICTS
     }
 
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>> {
         self.now = now;
-        let mut news = Vec::new();
+        let mut events = Vec::new();
         let place = self.place;
         for group in &mut self.running {
             group.retain_mut(|(cell, acts)| {
                 match acts.pop_front() {
-                    Some(Say(event) | Act::End(event)) => news.push(BackendEvent::Event(*cell, event)),
+                    Some(Say(event) | Act::End(event)) => events.push(BackendEvent::Event(*cell, event)),
                     Some(Wait(seconds)) if seconds > 1 => acts.push_front(Wait(seconds - 1)),
                     Some(Wait(_)) => {}
                     Some(Succeeds) => place.write(*cell, "result.json"),
                     Some(Fails) => place.fail(*cell),
-                    Some(Return) => news.push(BackendEvent::Returned(*cell)),
+                    Some(Return) => events.push(BackendEvent::Returned(*cell)),
                     None => panic!("an attempt at cell {cell} has no end"),
                 }
                 !acts.is_empty()
             });
         }
         self.running.retain(|group| !group.is_empty());
-        Ok(news)
+        Ok(events)
     }
 
     fn free_slots(&self) -> usize {

@@ -24,7 +24,7 @@ pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, comp
         points(it.difference, score),
         ends(interval),
         seeds(it),
-        shown(corrected),
+        format_p(corrected),
         if compared > 1 { format!(" after Holm for {compared} comparisons") } else { String::new() },
     );
     if it.is_decided() {
@@ -32,7 +32,7 @@ pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, comp
         return format!("{} has a {word} {than} than {} on {}: {numbers}", it.x, it.y, it.tested_on);
     }
     let why = if p < MAX_DECIDED_P {
-        format!("undecided after the correction (alone p {})", shown(p))
+        format!("undecided after the correction (alone p {})", format_p(p))
     } else {
         "undecided".into()
     };
@@ -123,6 +123,6 @@ fn ends([low, high]: [f64; 2]) -> String {
     format!("[{}, {}]", signed(low), signed(high))
 }
 
-fn shown(p: f64) -> String {
+fn format_p(p: f64) -> String {
     if p < 0.0005 { "< 0.001".into() } else { format!("= {p:.3}") }
 }

@@ -10,7 +10,7 @@ use std::collections::BTreeMap;
 use crate::records::{RecordedParameter, RecordedTest, Records};
 
 use perturb_settings::sets::Contexts;
-pub use sweeps::{Bin, Counted, bins, success_within, success_within_both};
+pub use sweeps::{Bin, SuccessCount, bins, success_within, success_within_both};
 pub use worst::{SHARE, conditional_value_at_risk, worst_contexts};
 
 /// The parameters and outcomes of all episodes of a policy's tests.

@@ -17,32 +17,32 @@ pub struct Bin {
 
 /// A number of episodes and the number of successes among them.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counted {
+pub struct SuccessCount {
     /// The number of successful episodes.
     pub successes: u64,
     /// The number of all episodes.
     pub episodes: u64,
 }
 
-impl Counted {
+impl SuccessCount {
     /// Returns the success rate, in %; NaN if there are no episodes.
     pub fn rate(self) -> f64 {
         100.0 * self.successes as f64 / self.episodes as f64
     }
 
-    /// Returns the 95 % interval of [`Counted::rate`] after Wilson (1927), [low, high] in %.
+    /// Returns the 95 % interval of [`SuccessCount::rate`] after Wilson (1927), [low, high] in %.
     pub fn interval(self) -> [f64; 2] {
         let (low, high) = wilson(self.successes, self.episodes);
         [100.0 * low, 100.0 * high]
     }
 
-    /// Returns [`Counted::interval`], or `None` if there are no episodes.
+    /// Returns [`SuccessCount::interval`], or `None` if there are no episodes.
     pub fn known(self) -> Option<[f64; 2]> {
         (self.episodes > 0).then(|| self.interval())
     }
 }
 
-impl std::iter::Sum for Counted {
+impl std::iter::Sum for SuccessCount {
     fn sum<I: Iterator<Item = Self>>(all: I) -> Self {
         all.fold(Self::default(), |a, b| Self {
             successes: a.successes + b.successes,
@@ -51,9 +51,9 @@ impl std::iter::Sum for Counted {
     }
 }
 
-/// Divides the range of the parameter with index `place` in `tests` into about ten equal bins. A gap wider than a tenth of the
-/// range belongs to no bin; version E (extreme) has such a gap between its two intervals. Returns no bins if the
-/// parameter does not vary.
+/// Divides the range of the parameter with index `place` in `tests` into about ten equal bins. A gap wider than
+/// a tenth of the range belongs to no bin; version E (extreme) has such a gap between its two intervals. Returns no
+/// bins if the parameter does not vary.
 pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<Bin> {
     let values = tests.filter_map(|outcomes| outcomes.parameters.get(place)).flatten();
     let mut values: Vec<f64> = values.copied().filter(|value| value.is_finite()).collect();
@@ -75,8 +75,8 @@ pub fn bins<'a>(tests: impl Iterator<Item = &'a Outcomes>, place: usize) -> Vec<
 }
 
 /// Counts the episodes and successes of `outcomes` in each of the `bins` of the parameter with index `place`.
-pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Counted> {
-    let mut counted = vec![Counted::default(); bins.len()];
+pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<SuccessCount> {
+    let mut counted = vec![SuccessCount::default(); bins.len()];
     let values = outcomes.parameters.get(place).into_iter().flatten();
     for (value, success) in values.zip(&outcomes.successes) {
         if let Some(bin) = counted.get_mut(bin_of(*value, bins)) {
@@ -89,8 +89,12 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Co
 
 /// Counts the episodes and successes of `outcomes` for each pair of bins of the two parameters with the indices `x` and `y`.
 /// Returns the counts `[Y, X]` as one array. The array is empty if one of the parameters does not vary.
-pub fn success_within_both(outcomes: &Outcomes, [x, y]: [usize; 2], [over_x, over_y]: [&[Bin]; 2]) -> Vec<Counted> {
-    let mut counted = vec![Counted::default(); over_x.len() * over_y.len()];
+pub fn success_within_both(
+    outcomes: &Outcomes,
+    [x, y]: [usize; 2],
+    [over_x, over_y]: [&[Bin]; 2],
+) -> Vec<SuccessCount> {
+    let mut counted = vec![SuccessCount::default(); over_x.len() * over_y.len()];
     let values = |place: usize| outcomes.parameters.get(place).into_iter().flatten();
     for ((x, y), success) in values(x).zip(values(y)).zip(&outcomes.successes) {
         if let Some(cell) = counted.get_mut(bin_of(*y, over_y) * over_x.len() + bin_of(*x, over_x)) {
@@ -137,6 +141,6 @@ mod tests {
         let of = |bin: usize| (counted[bin].successes, counted[bin].episodes);
         assert_eq!([0, 1, 2, 3, 4].map(of), [(1, 1), (1, 1), (0, 0), (0, 0), (1, 2)], "0.95 fails");
         assert!(super::bins([&outcomes()].into_iter(), 0).is_empty(), "it does not vary");
-        assert_eq!(counted.into_iter().sum::<Counted>(), Counted { successes: 3, episodes: 4 });
+        assert_eq!(counted.into_iter().sum::<SuccessCount>(), SuccessCount { successes: 3, episodes: 4 });
     }
 }

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use perturb_files::{AnyError, FileError, read_if_there, write_atomically};
+use perturb_files::{AnyError, FileError, read_if_exists, write_atomically};
 
 use super::{Ending, EpisodeRecord, Records, RecordsMetadata};
 use crate::parquet_file::{ParquetFile, RowGroup, encode, one_group};
@@ -59,7 +59,7 @@ impl Records {
     /// # Errors
     /// [`RecordsError`] if the file does not exist, is not a Parquet file or is damaged.
     pub fn read(path: &Path) -> Result<Self, RecordsError> {
-        let content = read_if_there(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
+        let content = read_if_exists(path)?.ok_or_else(|| RecordsError::Missing { path: path.to_owned() })?;
         if ParquetFile::is_other(&content) {
             return Err(RecordsError::Other { path: path.to_owned() });
         }

@@ -111,7 +111,7 @@ impl ResultsTable {
     fn values(&self, name: &str) -> Result<Vec<String>, ValueError> {
         let columns = self.columns();
         if let Some((_, values)) = columns.iter().find(|(column, _)| column == name) {
-            return Ok((0..self.rows().len()).map(|row| values.shown(row)).collect());
+            return Ok((0..self.rows().len()).map(|row| values.value_text(row)).collect());
         }
         let setting = |row: &TableRow| {
             let settings: serde_json::Value = serde_json::from_str(&row.settings).unwrap_or_default();

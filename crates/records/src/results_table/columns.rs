@@ -56,7 +56,7 @@ impl ResultsTable {
         let mut writer = csv::Writer::from_writer(Vec::new());
         writer.write_record(columns.iter().map(|(name, _)| name))?;
         for row in 0..self.rows.len() {
-            writer.write_record(columns.iter().map(|(_, values)| values.shown(row)))?;
+            writer.write_record(columns.iter().map(|(_, values)| values.value_text(row)))?;
         }
         Ok(writer.into_inner().map_err(|error| error.to_string())?)
     }
@@ -73,7 +73,7 @@ pub(super) fn decode(file: &ParquetFile) -> Result<Vec<TableRow>, AnyError> {
 
 /// Reads the rows of a row group: reads all columns, and takes the values of each row from them.
 fn rows_of(group: &RowGroup<'_>) -> Result<Vec<TableRow>, AnyError> {
-    let place = |name: &str| group.place(name).ok_or_else(|| format!("it has no column {name}"));
+    let place = |name: &str| group.column_index(name).ok_or_else(|| format!("it has no column {name}"));
     let texts = |name: &str| -> Result<_, AnyError> { Ok(group.texts(place(name)?)?.into_iter()) };
     let optional_texts = |name: &str| -> Result<_, AnyError> { Ok(group.optional_texts(place(name)?)?.into_iter()) };
     let counts = |name: &str| -> Result<_, AnyError> { Ok(group.optional_unsigned_64(place(name)?)?.into_iter()) };

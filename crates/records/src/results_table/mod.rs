@@ -9,7 +9,7 @@ mod columns;
 use std::collections::{BTreeMap, HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
-use perturb_files::{FileError, read_if_there, write_atomically};
+use perturb_files::{FileError, read_if_exists, write_atomically};
 use serde::{Deserialize, Serialize};
 
 use crate::parquet_file::{ParquetFile, encode, one_group};
@@ -146,15 +146,15 @@ impl ResultsTable {
     /// # Errors
     /// [`TableError`] if the file is missing, damaged or too new.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        Self::read_if_there(path)?.ok_or_else(|| TableError::Missing { path: path.to_owned() })
+        Self::read_if_exists(path)?.ok_or_else(|| TableError::Missing { path: path.to_owned() })
     }
 
     /// Reads the table at `path`. Returns `None` if the file does not exist.
     ///
     /// # Errors
     /// [`TableError`] if the file is damaged or too new.
-    pub fn read_if_there(path: &Path) -> Result<Option<Self>, TableError> {
-        let Some(content) = read_if_there(path)? else { return Ok(None) };
+    pub fn read_if_exists(path: &Path) -> Result<Option<Self>, TableError> {
+        let Some(content) = read_if_exists(path)? else { return Ok(None) };
         let damaged = |reason: String| TableError::Damaged { path: path.to_owned(), reason };
         if content.is_empty() || ParquetFile::is_other(&content) {
             return Err(damaged("it is no Parquet file".into()));

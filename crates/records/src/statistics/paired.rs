@@ -7,7 +7,7 @@ use rand::Rng;
 /// Maximum number of pairs for which the p-value is exact: all 2ⁿ combinations of signs are counted.
 const MAX_EXACT_PAIRS: usize = 16;
 /// Number of random combinations of signs that are counted if there are more than [`MAX_EXACT_PAIRS`] pairs.
-const CHOICES: u32 = 100_000;
+const N_SIGN_SAMPLES: u32 = 100_000;
 
 /// Returns the p-value of Fisher's two-sided randomisation test for paired differences (The Design of Experiments,
 /// 1935). It is the probability that the sum of the differences is at least as far from 0 as observed, if each
@@ -31,8 +31,8 @@ pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
         return (0..all).filter(|&signs| is_as_far(signs)).count() as f64 / all as f64;
     }
     let mut rng = stream(seed, Purpose::Bootstrap);
-    let as_far = (0..CHOICES).filter(|_| is_as_far(rng.next_u64())).count();
-    (1 + as_far) as f64 / f64::from(1 + CHOICES)
+    let as_far = (0..N_SIGN_SAMPLES).filter(|_| is_as_far(rng.next_u64())).count();
+    (1 + as_far) as f64 / f64::from(1 + N_SIGN_SAMPLES)
 }
 
 /// Returns the p-values of several comparisons after Holm's correction (1979), in the given order. If every comparison

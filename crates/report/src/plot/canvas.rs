@@ -110,7 +110,7 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
     }
 
     /// Writes a text rotated by 90°, to be read from bottom to top, with its middle at the position.
-    pub(super) fn upright(&self, text: &str, at: CanvasPoint) -> Result<(), PlotError> {
+    pub(super) fn vertical_text(&self, text: &str, at: CanvasPoint) -> Result<(), PlotError> {
         let turned = font(self.scale).transform(FontTransform::Rotate270);
         self.styled(text, turned.pos(Pos::new(HPos::Center, VPos::Center)), at)
     }
@@ -139,16 +139,16 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
 
     pub(super) fn line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
         match style.dashes {
-            None => self.whole_line(points, style),
+            None => self.solid_line(points, style),
             Some((dash, gap)) => {
                 let dashes = dashes(points, dash.into(), gap.into());
-                dashes.iter().try_for_each(|dash| self.whole_line(dash, style))
+                dashes.iter().try_for_each(|dash| self.solid_line(dash, style))
             }
         }
     }
 
     /// Draws a solid line.
-    fn whole_line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
+    fn solid_line(&self, points: &[CanvasPoint], style: LineStyle) -> Result<(), PlotError> {
         let points: Vec<_> = points.iter().map(|point| self.at(*point)).collect();
         self.area.draw(&PathElement::new(points, self.stroke(style.colour, style.width))).map_err(drawing)
     }

@@ -10,17 +10,17 @@ use super::colours::GRID;
 use super::ticks::round_ticks;
 
 /// Minimum gap between neighbouring numbers below the x axis, in units.
-const BETWEEN: f64 = 6.0;
+const MIN_NUMBER_GAP: f64 = 6.0;
 /// Minimum gap between the numbers of the first and the last tick if only these have numbers, in units. It is the width
 /// of a space.
-const SPACE: f64 = 4.6;
+const MIN_END_GAP: f64 = 4.6;
 /// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. The limit is small,
 /// because another frame may be next to it.
-const BEYOND: f64 = 2.0;
+const MAX_OVERHANG: f64 = 2.0;
 /// Maximum number of ticks of an axis.
 const MAX_TICKS: usize = 6;
 /// The style of the grid lines behind a chart.
-const BEHIND: LineStyle = LineStyle { colour: GRID, width: 1, dashes: None };
+const GRID_STYLE: LineStyle = LineStyle { colour: GRID, width: 1, dashes: None };
 /// Height of the ticks and numbers below an x axis, in units.
 pub(super) const NUMBERS: f64 = LINE + 5.0;
 /// Width of a y axis' name with the gap to the axis' numbers, in units.
@@ -66,11 +66,12 @@ impl Frame {
         let sets: Vec<_> = (2..=MAX_TICKS).rev().map(|most| round_ticks(&self.x, most)).collect();
         // A single tick would not show the scale of the axis.
         let several = || sets.iter().filter(|ticks| ticks.len() > 1);
-        let mut all = several().filter(|ticks| ticks.windows(2).all(|pair| self.gap(&pair[0], &pair[1]) >= BETWEEN));
+        let mut all =
+            several().filter(|ticks| ticks.windows(2).all(|pair| self.gap(&pair[0], &pair[1]) >= MIN_NUMBER_GAP));
         if let Some(ticks) = all.next() {
             return numbered(ticks, |_| true);
         }
-        let mut ends = several().filter(|ticks| self.gap(&ticks[0], &ticks[ticks.len() - 1]) >= SPACE);
+        let mut ends = several().filter(|ticks| self.gap(&ticks[0], &ticks[ticks.len() - 1]) >= MIN_END_GAP);
         if let Some(ticks) = ends.next() {
             return numbered(ticks, |index| index == 0 || index + 1 == ticks.len());
         }
@@ -87,7 +88,7 @@ impl Frame {
     /// Returns the x position, in units, of the middle of the number below a tick. Near the edges the number is moved
     /// inwards.
     fn number(&self, value: f64, number: &str) -> f64 {
-        let half = text_width(number) / 2.0 - BEYOND;
+        let half = text_width(number) / 2.0 - MAX_OVERHANG;
         self.x(value).clamp(self.left + half, (self.right() - half).max(self.left + half))
     }
 
@@ -122,10 +123,10 @@ impl<DB: DrawingBackend> PlotCanvas<'_, DB> {
         let (right, bottom) = (frame.right(), frame.bottom());
         if with_lines {
             for (value, _) in frame.x_ticks() {
-                self.line(&[(frame.x(value), top), (frame.x(value), bottom)], BEHIND)?;
+                self.line(&[(frame.x(value), top), (frame.x(value), bottom)], GRID_STYLE)?;
             }
             for (value, _) in frame.y_ticks().into_iter().filter(|_| !frame.y.is_empty()) {
-                self.line(&[(left, frame.y(value)), (right, frame.y(value))], BEHIND)?;
+                self.line(&[(left, frame.y(value)), (right, frame.y(value))], GRID_STYLE)?;
             }
         }
         self.line(&[(left, top), (left, bottom), (right, bottom)], TICK)

@@ -21,9 +21,9 @@ pub use scale::common_returns;
 /// Maximum number of columns in a single row.
 const MAX_COLUMNS: usize = 4;
 /// Number of columns in each row if there are more than [`MAX_COLUMNS`].
-const FEWER: usize = 3;
+const COLUMNS_IF_SEVERAL_ROWS: usize = 3;
 /// Maximum width of a panel, in units.
-const WIDEST: f64 = 210.0;
+const MAX_PANEL_WIDTH: f64 = 210.0;
 /// Minimum and maximum height of a panel, in units.
 const HEIGHTS: Range<f64> = 96.0..150.0;
 /// Gap between panels, and between a panel and the texts below it, in units.
@@ -36,7 +36,7 @@ const RANDOM: [LineStyle; 2] = [outline(BLACK, 4), outline(WHITE, 2)];
 /// The outline of the boxes that show the ranges of version E: a red line on a wider white line.
 const EXTREME: [LineStyle; 2] = [outline(WHITE, 4), outline(RGBColor(200, 30, 30), 2)];
 /// Minimum distance of a box from the edges of its panel, in units.
-const WITHIN: f64 = 2.0;
+const BOX_MARGIN: f64 = 2.0;
 /// Width and height of a symbol in the legend, in units.
 const SAMPLE: (f64, f64) = (24.0, 14.0);
 
@@ -110,7 +110,7 @@ impl Plot for HeatmapPanels {
                     canvas.x_ticks(&frame, true)?;
                     canvas.y_ticks(&frame, column == 0)?;
                     if column == 0 {
-                        canvas.upright(&label(y), (MARGIN + LINE / 2.0, frame.middle().1))?;
+                        canvas.vertical_text(&label(y), (MARGIN + LINE / 2.0, frame.middle().1))?;
                     }
                 }
                 top += self.row_height(row);
@@ -144,7 +144,7 @@ impl HeatmapPanels {
 
     /// Returns the number of columns in each row of the picture.
     fn per_row(&self) -> usize {
-        if self.columns.len() > MAX_COLUMNS { FEWER } else { self.columns.len().max(1) }
+        if self.columns.len() > MAX_COLUMNS { COLUMNS_IF_SEVERAL_ROWS } else { self.columns.len().max(1) }
     }
 
     /// Returns the picture's columns, divided into the picture's rows.
@@ -159,7 +159,7 @@ impl HeatmapPanels {
         let columns = self.per_row() as f64;
         // Leaves 2 units on the right, because the last number on the x axis may extend beyond its panel by as much.
         let width = (f64::from(WIDTH) - left - MARGIN - 2.0 - GAP * (columns - 1.0)) / columns;
-        (width.min(WIDEST), width.clamp(HEIGHTS.start, HEIGHTS.end))
+        (width.min(MAX_PANEL_WIDTH), width.clamp(HEIGHTS.start, HEIGHTS.end))
     }
 
     /// Returns the frame of the panel in this column of a row, whose upper edge is at `top`.
@@ -200,8 +200,8 @@ impl HeatmapPanels {
             for &(left, right) in x_pairs {
                 for &(bottom, top) in y_pairs {
                     let inside = |(x, y): CanvasPoint| {
-                        let x = x.clamp(frame.left + WITHIN, frame.right() - WITHIN);
-                        (x, y.clamp(frame.top + WITHIN, frame.bottom() - WITHIN))
+                        let x = x.clamp(frame.left + BOX_MARGIN, frame.right() - BOX_MARGIN);
+                        (x, y.clamp(frame.top + BOX_MARGIN, frame.bottom() - BOX_MARGIN))
                     };
                     let corners = [(frame.x(left), frame.y(top)), (frame.x(right), frame.y(bottom))];
                     canvas.outline(corners.map(inside), lines)?;

@@ -191,7 +191,7 @@ impl PlotPanel {
         canvas.frame(frame, true)?;
         canvas.x_ticks(frame, numbers)?;
         canvas.y_ticks(frame, true)?;
-        canvas.upright(&self.y_name, (MARGIN + LINE / 2.0, frame.middle().1))?;
+        canvas.vertical_text(&self.y_name, (MARGIN + LINE / 2.0, frame.middle().1))?;
         // Values outside the range of the axis are drawn at its end.
         let within = |y: f64| frame.y(y).clamp(frame.top, frame.bottom());
         for PanelLine { index, points } in &self.lines {

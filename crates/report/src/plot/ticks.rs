@@ -7,7 +7,7 @@ use std::ops::Range;
 pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)> {
     let span = range.end - range.start;
     if !span.is_finite() || span <= 0.0 {
-        return vec![(range.start, tick(range.start))];
+        return vec![(range.start, format_number(range.start))];
     }
     let smallest = (span / most.max(1) as f64).log10().floor() as i32;
     // Tolerance, in steps between ticks. Without it, rounding errors could exclude a tick at an end of the range.
@@ -27,7 +27,7 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     };
     let values: Vec<f64> = (0..=(last - first) as i32).map(value).collect();
     let largest = values.iter().fold(0.0, |largest: f64, value| largest.max(value.abs()));
-    values.into_iter().map(|value| (value, written(value, power, largest))).collect()
+    values.into_iter().map(|value| (value, format_tick(value, power, largest))).collect()
 }
 
 /// Widens `range` on both sides to the next tick. Returns an empty range unchanged.
@@ -46,22 +46,22 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
 
 /// Formats a tick. All ticks of the axis are multiples of 10^`power`, which decides on the number of decimals. `largest` is
 /// the largest tick. This tick decides whether all ticks are written in thousands (k) or millions (M).
-fn written(value: f64, power: i32, largest: f64) -> String {
+fn format_tick(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {
         return format!("{:.*}", power.unsigned_abs() as usize, value + 0.0);
     }
     let decimals = |of: i32| (of - power).max(0) as usize;
     match largest {
-        _ if value == 0.0 => tick(value),
+        _ if value == 0.0 => format_number(value),
         1e6.. => format!("{:.*}M", decimals(6), value / 1e6),
         10_000.0.. => format!("{:.*}k", decimals(3), value / 1e3),
-        _ => tick(value),
+        _ => format_number(value),
     }
 }
 
 /// Formats a number for an axis: short, and without rounding errors of binary fractions.
-fn tick(number: f64) -> String {
+fn format_number(number: f64) -> String {
     let digits = match number.abs() {
         1e6.. => return format!("{}M", (number / 1e5).round() / 10.0),
         10_000.0.. => return format!("{}k", (number / 100.0).round() / 10.0),
@@ -91,7 +91,7 @@ mod tests {
     #[case(-12_345.0, "-12.3k")]
     #[case(2_520_000.0, "2.5M")]
     fn numbers_at_an_axis_are_short(#[case] number: f64, #[case] shown: &str) {
-        assert_eq!(tick(number), shown);
+        assert_eq!(format_number(number), shown);
     }
 
     #[rstest]

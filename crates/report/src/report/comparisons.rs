@@ -121,8 +121,8 @@ impl Report<'_> {
             .number("X − Y", |row| row.difference)
             .number("P(X > Y)", |row| format!("{:.2}", row.improvement))
             .number("pairs", |row| row.pairs)
-            .number("p", |row| shown(row.p))
-            .number("corrected", |row| shown(row.corrected))
+            .number("p", |row| format_p(row.p))
+            .number("corrected", |row| format_p(row.corrected))
             .build();
         Some(table)
     }
@@ -151,7 +151,7 @@ impl Report<'_> {
 }
 
 /// Formats a p-value with three decimals. A p-value that would be rounded to 0.000 becomes "< 0.001".
-pub(super) fn shown(p: f64) -> String {
+pub(super) fn format_p(p: f64) -> String {
     if p < 0.0005 {
         "< 0.001".into()
     } else if p.is_nan() {

@@ -147,7 +147,7 @@ fn a_folder_is_an_experiment_or_an_assessment() {
     sources.add(&directory.path().join("agent")).unwrap();
     for name in ["one", "two"] {
         let folder = perturb_experiment::ExperimentFolder::new(&directory.path().join(name));
-        folder.keep_plan(&Plan::parse("test", PLAN.into()).unwrap()).unwrap();
+        folder.store_plan(&Plan::parse("test", PLAN.into()).unwrap()).unwrap();
     }
     sources.add(&directory.path().join("one")).unwrap();
     assert_eq!((sources.assessed.len(), sources.folder.is_some()), (1, true));

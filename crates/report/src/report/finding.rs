@@ -133,7 +133,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
         learned.iter().filter_map(|row| both(row).map(|(default, mean)| (*row, default, mean))).collect();
     ranked.sort_by(|(.., a), (.., b)| b.point.total_cmp(&a.point));
     let &(best, default, extrapolation) = ranked.first()?;
-    let numbers = format!("Extrapolation of {} and Default of {}", shown(extrapolation), shown(default));
+    let numbers = format!("Extrapolation of {} and Default of {}", format_mean(extrapolation), format_mean(default));
     let zeros = zero_sentence(ranked.iter().filter(|(.., mean)| mean.point == 0.0).map(|(row, ..)| *row));
     if ranked.len() == 1 {
         return Some(format!("{} comes to {numbers}.{zeros}", best.method));
@@ -150,7 +150,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
         _ => format!(
             "none {claimed}: {} come to the same Extrapolation, {}",
             listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
-            listed(&distinct(first.iter().map(|(.., mean)| shown(*mean)))),
+            listed(&distinct(first.iter().map(|(.., mean)| format_mean(*mean)))),
         ),
     };
     // Compares the intervals of the best methods and of the next method, if all of these have one.
@@ -161,7 +161,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
             (Some(_), Some(_)) => ", and their intervals overlap",
             _ => "",
         };
-        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, shown(*extrapolation))
+        format!("; next is {}, with Extrapolation of {}{intervals}", row.method, format_mean(*extrapolation))
     });
     let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
     let differences: Vec<f64> = ranked.iter().map(|(_, default, mean)| rounded(mean.point - default.point)).collect();
@@ -188,7 +188,7 @@ fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) 
 }
 
 /// Formats a mean with its interval, e.g. "8.0 % [6.5, 9.0]". Adds "(1 run)" to the mean of a single run.
-fn shown(mean: Bootstrapped) -> String {
+fn format_mean(mean: Bootstrapped) -> String {
     match mean.interval_95 {
         Some([low, high]) => format!("{:.1} % [{:.1}, {:.1}]", mean.point, low + 0.0, high + 0.0), // no negative zero
         None if mean.runs == 1 => format!("{:.1} % (1 run)", mean.point),

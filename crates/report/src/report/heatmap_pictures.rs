@@ -94,7 +94,8 @@ pub fn heatmap_pictures(
         let mut drafts = Vec::new();
         for kind in kinds {
             for places in places.chunk_by(|a, b| a.method == b.method) {
-                let shown = places.iter().map(|place| shown(place, folder, kind)).collect::<Result<Vec<_>, _>>()?;
+                let shown =
+                    places.iter().map(|place| read_heatmap(place, folder, kind)).collect::<Result<Vec<_>, _>>()?;
                 drafts.push(Draft::new((environment, places[0].method), kind, shown));
             }
             for (method, shown) in &elsewhere {
@@ -115,7 +116,7 @@ pub fn heatmap_pictures(
 }
 
 /// Reads the heatmap of a cell's policy.
-fn shown<'a>(
+fn read_heatmap<'a>(
     place: &HeatmapPlace<'a>,
     folder: Option<&ExperimentFolder>,
     kind: Option<&HeatmapKind>,

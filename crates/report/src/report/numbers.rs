@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use perturb_experiment::{
     MethodResults, SelectedRun, SelectionBootstrap, TieRange, average, average_tie_range, interquartile, scores,
 };
-use perturb_records::outcomes::Counted;
+use perturb_records::outcomes::SuccessCount;
 use perturb_records::statistics::{Bootstrapped, Summary, interquartile_mean, mean_with_t_interval, optimality_gap};
 use perturb_records::{Metric, Scenario, TestResult, TrainedOn, paper};
 use perturb_settings::Method;
@@ -131,10 +131,10 @@ pub(super) fn averages<'a>(
 
 /// Counts the successes and the episodes of a test, over all runs and over all tied configurations. Configurations are
 /// tied if they have the same result in the selection.
-pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, tested_on: &str) -> Counted {
+pub(super) fn counted(selection: &MethodResults<'_>, trained_on: TrainedOn<'_>, tested_on: &str) -> SuccessCount {
     let trained = selection.runs.values().flat_map(|run| run.tied_on(trained_on));
     let tests = trained.filter_map(|selected| selected.test(tested_on));
-    let of = |test: &TestResult| Counted {
+    let of = |test: &TestResult| SuccessCount {
         successes: (test.success_percent * test.episodes as f64 / 100.0).round() as u64,
         episodes: test.episodes,
     };

@@ -197,7 +197,7 @@ impl StudySource {
         checks: &mut Vec<ParameterCheck>,
     ) -> Result<(), ReportError> {
         let Some(folder) = folder else {
-            let episodes = StudyEpisodes::read_if_there(&self.episodes)?.unwrap_or_default();
+            let episodes = StudyEpisodes::read_if_exists(&self.episodes)?.unwrap_or_default();
             for result in results.done() {
                 let records = episodes.of_cell(&result.id);
                 checks.extend(records.map(Records::agreement));

@@ -2,7 +2,7 @@
 
 use perturb_experiment::{MethodResults, Recorded, distinct};
 use perturb_protocol::Version;
-use perturb_records::outcomes::{Bin, Counted, Outcomes, PolicyOutcomes, bins, success_within};
+use perturb_records::outcomes::{Bin, Outcomes, PolicyOutcomes, SuccessCount, bins, success_within};
 use perturb_records::{RecordedParameter, TrainedOn};
 use perturb_settings::Method;
 use perturb_text::Table;
@@ -22,7 +22,7 @@ pub(super) struct SweepPoint<'a> {
     parameter: &'a RecordedParameter,
     bin: Bin,
     runs: usize,
-    counted: Counted,
+    counted: SuccessCount,
 }
 
 /// The selected policies of a method and a training distribution that have recorded episodes, one for each run.
@@ -66,10 +66,10 @@ pub(super) fn over_parameters<'a>(
                 let bins = bins(groups.iter().flat_map(|group| group.tests(tested_on)), place);
                 for group in &groups {
                     let tests = group.tests(tested_on);
-                    let by_run: Vec<Vec<Counted>> = tests.map(|test| success_within(test, place, &bins)).collect();
+                    let by_run: Vec<Vec<SuccessCount>> = tests.map(|test| success_within(test, place, &bins)).collect();
                     let PolicyGroup { method, trained_on, .. } = *group;
                     for (index, &bin) in bins.iter().enumerate() {
-                        let counted: Counted = by_run.iter().map(|bins| bins[index]).sum();
+                        let counted: SuccessCount = by_run.iter().map(|bins| bins[index]).sum();
                         let runs = by_run.len();
                         if counted.episodes > 0 {
                             all.push(SweepPoint {

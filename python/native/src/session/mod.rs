@@ -262,7 +262,7 @@ impl PythonSession {
         let request = proto::Step { actions: self.actions.encode(action, encode)? };
         let open = self.take(0)?;
         let (labels, stepped) = self.ask(py, open, request)?;
-        self.note(&stepped)?;
+        self.store_step(&stepped)?;
         let observation = arrays::row(py, &stepped.observations, self.observation_size)?;
         let reward = stepped.rewards.as_chunks::<4>().0.first().map_or(f32::NAN, |word| f32::from_le_bytes(*word));
         let flag = |flags: &Bytes| flags.first().is_some_and(|&flag| flag != 0);
@@ -484,7 +484,7 @@ impl PythonSession {
     }
 
     /// Checks the reply to a step, and stores the reply's observations and flags in `last`.
-    fn note(&self, stepped: &proto::Stepped) -> PyResult<()> {
+    fn store_step(&self, stepped: &proto::Stepped) -> PyResult<()> {
         check_step(stepped, self.actions.num_envs, self.observation_size).map_err(|error| malformed(&error))?;
         *unpoisoned(&self.last) = LastStep {
             observations: stepped.observations.clone(),
@@ -501,7 +501,7 @@ impl PythonSession {
         stepped: proto::Stepped,
     ) -> PyResult<StepArrays<'py>> {
         let n = self.actions.num_envs;
-        self.note(&stepped)?;
+        self.store_step(&stepped)?;
         Ok((
             arrays::rows(py, &stepped.observations, n, self.observation_size)?,
             arrays::floats(py, &stepped.rewards, n)?,

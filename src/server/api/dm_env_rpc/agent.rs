@@ -58,7 +58,7 @@ impl Agent {
             return Err(session::Error::Draining.into());
         }
         let (settings, version, ownership) = settings::create(self.worlds.catalogue(), &request.settings)?;
-        self.worlds.is_free(&self.caller, &ownership)?;
+        self.worlds.check_name_is_free(&self.caller, &ownership)?;
         let env_quota = self.caller.envs(1)?;
         let runner = Runner::open(self.worlds.pool(), settings, version, self.worlds.draws(&self.caller)).await?;
         Ok(rpc::CreateWorldResponse { world_name: self.worlds.add(&self.caller, runner, ownership, env_quota)? })
@@ -88,7 +88,7 @@ impl Agent {
         } else {
             let changes = world.take_changes();
             let begun = runner.begin(changes.clone()).await;
-            begun.inspect_err(|_| world.keep(changes))?
+            begun.inspect_err(|_| world.restore_changes(changes))?
         };
         Ok(specs::response(&outcome, &request.requested_observations))
     }
@@ -177,7 +177,7 @@ impl SessionHandler for Agent {
 
     /// Whether the stream has joined a world, or has made a world that still exists.
     fn is_open(&self) -> bool {
-        self.joined.is_some() || self.worlds.are_made_by(&self.caller)
+        self.joined.is_some() || self.worlds.has_world_of(&self.caller)
     }
 
     fn stats(&self) -> SessionStats {

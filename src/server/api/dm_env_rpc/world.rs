@@ -96,7 +96,7 @@ impl World {
 
     /// Stores changes again, because the episode for which they were taken could not begin. Later changes take
     /// precedence.
-    pub(super) fn keep(&self, changes: Changes) {
+    pub(super) fn restore_changes(&self, changes: Changes) {
         let mut pending = self.lock();
         pending.seed = pending.seed.or(changes.seed);
         pending.new_distributions |= changes.distributions.is_some();

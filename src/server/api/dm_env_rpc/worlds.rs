@@ -104,7 +104,7 @@ impl Worlds {
     ///
     /// # Errors
     /// [`Error::Taken`], if a world of the same token has the name.
-    pub(super) fn is_free(&self, maker: &Caller, ownership: &Ownership) -> Result<(), Error> {
+    pub(super) fn check_name_is_free(&self, maker: &Caller, ownership: &Ownership) -> Result<(), Error> {
         match ownership.name.as_ref().filter(|name| self.lock().worlds.contains_key(&maker.key(name))) {
             Some(name) => Err(Error::Taken { world: name.clone() }),
             None => Ok(()),
@@ -189,7 +189,7 @@ impl Worlds {
     }
 
     /// Whether a world that this stream made still exists.
-    pub(super) fn are_made_by(&self, caller: &Caller) -> bool {
+    pub(super) fn has_world_of(&self, caller: &Caller) -> bool {
         self.lock().worlds.values().any(|entry| entry.maker == Some(caller.stream))
     }
 

@@ -9,7 +9,7 @@ use perturb_files::{AnyError, Lock, create_folder, io, open_plain};
 
 use perturb_text::shortened;
 
-use super::super::event::{last_words, read_lines};
+use super::super::event::{last_log_line, read_lines};
 use super::super::{Backend, BackendEvent, CellEvent, PendingCell, Result, RunError, count};
 use super::batch::{CellLoad, JOB_SECONDS, JobSize, batches};
 use super::commands::{QueueAnswer, Slurm};
@@ -60,7 +60,7 @@ pub struct Jobs<'a> {
     /// The last reported reason why Slurm does not answer or does not accept jobs; `None` after an answer.
     trouble: Option<String>,
     /// Events for the next call of `poll`.
-    news: Vec<BackendEvent>,
+    pending_events: Vec<BackendEvent>,
 }
 
 /// Read position in the event file of a job (bytes), and the cells that the job has started according to its events.
@@ -102,7 +102,7 @@ impl<'a> Jobs<'a> {
             ask_at: None,
             foreign: HashSet::new(),
             trouble: None,
-            news: Vec::new(),
+            pending_events: Vec::new(),
         }
     }
 
@@ -117,7 +117,8 @@ impl<'a> Jobs<'a> {
         for line in foreign {
             if self.foreign.len() < MAX_FOREIGN_LINES && self.foreign.insert(line.clone()) {
                 let line = shortened(line);
-                self.news.push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
+                self.pending_events
+                    .push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
             }
         }
         // If the folder was deleted and created again, older arrays may have the same names.
@@ -142,14 +143,15 @@ impl<'a> Jobs<'a> {
     fn report_and_continue(&mut self, error: &RunError) {
         let words = error.to_string();
         if self.trouble.as_ref() != Some(&words) {
-            self.news.push(BackendEvent::Note(format!("{words}; results are still read, and Slurm is asked again")));
+            self.pending_events
+                .push(BackendEvent::Note(format!("{words}; results are still read, and Slurm is asked again")));
             self.trouble = Some(words);
         }
     }
 
     /// Reports the arrays that are in the queue. Stores the number of an array if the process that submitted it was
     /// interrupted before it could store the number.
-    fn adopt(&mut self) -> Result<()> {
+    fn report_queued_arrays(&mut self) -> Result<()> {
         for submission in &mut self.submissions {
             let jobs: Vec<_> = self.queue.iter().filter(|job| job.is_live() && submission.has(job)).collect();
             let Some(first) = jobs.first() else { continue };
@@ -158,7 +160,8 @@ impl<'a> Jobs<'a> {
             }
             if self.watched.insert(submission.number) {
                 let jobs = count(jobs.len(), "job");
-                self.news.push(BackendEvent::Note(format!("Slurm job {} is in the queue, with {jobs}", first.array)));
+                self.pending_events
+                    .push(BackendEvent::Note(format!("Slurm job {} is in the queue, with {jobs}", first.array)));
             }
         }
         Ok(())
@@ -176,12 +179,12 @@ impl<'a> Jobs<'a> {
         let cursor = self.cursors.entry((submission.number, index)).or_default();
         for line in read_lines(&file, &mut cursor.offset).map_err(io("read", &path))? {
             let Some(&cell) = self.places.get(&*line.cell) else { continue };
-            if line.event.is_a_turn() {
+            if line.event.shows_work() {
                 cursor.cells.insert(cell);
             }
             // A job repeats failed attempts itself, so the end of an attempt is not reported while the job runs.
             if !line.event.is_last() {
-                self.news.push(BackendEvent::Event(cell, line.event));
+                self.pending_events.push(BackendEvent::Event(cell, line.event));
             }
         }
         Ok(())
@@ -190,7 +193,7 @@ impl<'a> Jobs<'a> {
     /// Reads the events of running jobs, and hands back the unfinished cells whose jobs have left the queue. A job must
     /// be missing in two successive answers of Slurm, because on a network file system its result may become visible
     /// only some time after its end.
-    fn give_back(&mut self) -> Result<()> {
+    fn return_lost_cells(&mut self) -> Result<()> {
         let jobs: HashSet<(usize, usize)> = self.taken.iter().filter_map(|cell| self.last.get(cell).copied()).collect();
         for (submission, index) in jobs {
             if let Err(error) = self.read(submission, index) {
@@ -212,7 +215,7 @@ impl<'a> Jobs<'a> {
             let begun = job.and_then(|job| self.cursors.get(&job)).map(|cursor| &cursor.cells);
             // The job had not started this cell, so its end does not count as a failed attempt.
             let was_started = begun.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
-            self.news.push(match was_started {
+            self.pending_events.push(match was_started {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.describe_end(cell) }),
                 false => BackendEvent::Returned(cell),
             });
@@ -247,7 +250,8 @@ impl<'a> Jobs<'a> {
             how.push("and others".into());
         }
         let cells = count(cells.len(), "cell");
-        self.news.push(BackendEvent::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
+        self.pending_events
+            .push(BackendEvent::Note(format!("{cells} left Slurm's queue without a result ({})", how.join(", "))));
     }
 
     /// Returns the name of a cell's last job, e.g. "17_3", and its state in Slurm's last answer.
@@ -265,7 +269,7 @@ impl<'a> Jobs<'a> {
         let log = self.last.get(&cell).map(|&(submission, index)| self.submissions[submission].log(index));
         let log = log.unwrap_or_default();
         let shown = log.display();
-        match last_words(&log, 0) {
+        match last_log_line(&log, 0) {
             Some(words) => format!("Slurm job {job} ({state}) said `{words}`, see {shown}"),
             None => format!("Slurm job {job} ({state}) wrote nothing to {shown}: do the nodes see this folder?"),
         }
@@ -275,7 +279,7 @@ impl<'a> Jobs<'a> {
     fn submit(&mut self, groups: &[Vec<PendingCell>]) -> Result<Vec<usize>> {
         let max_jobs = match self.slurm.max_jobs(self.stop) {
             Ok(number) => number,
-            Err(error) => return self.put_off(error.into()),
+            Err(error) => return self.postpone_submission(error.into()),
         };
         // Divides the cells into jobs, and writes the files of the submission.
         let jobs = batches(&self.loads(groups)?, self.size(), max_jobs);
@@ -288,14 +292,14 @@ impl<'a> Jobs<'a> {
             Ok(array) => array,
             Err(error @ (SlurmError::Refused { .. } | SlurmError::NotInstalled { .. } | SlurmError::Option(_))) => {
                 submission.forget()?; // Slurm accepted nothing
-                return self.put_off(error.into());
+                return self.postpone_submission(error.into());
             }
             Err(error) => return Err(error.into()),
         };
         submission.accepted(&array)?;
         // Informs the user, and follows the jobs from now on.
         let most = jobs.iter().map(Vec::len).max().unwrap_or_default();
-        self.news.push(BackendEvent::Note(format!(
+        self.pending_events.push(BackendEvent::Note(format!(
             "submitted {} as Slurm job {array}: {} of at most {}",
             count(cells.len(), "cell"),
             count(jobs.len(), "job"),
@@ -310,7 +314,7 @@ impl<'a> Jobs<'a> {
 
     /// Handles a refused submission. If other jobs are in the queue, a limit on their number may be the cause, so the
     /// cells wait for a later submission. Otherwise the error ends the run.
-    fn put_off(&mut self, error: RunError) -> Result<Vec<usize>> {
+    fn postpone_submission(&mut self, error: RunError) -> Result<Vec<usize>> {
         if self.live().next().is_none() {
             return Err(error);
         }
@@ -370,7 +374,7 @@ impl Backend for Jobs<'_> {
     }
 
     /// Returns false: the scheduler finds results in the folder.
-    fn tells_ends(&self) -> bool {
+    fn reports_ends(&self) -> bool {
         false
     }
 
@@ -384,8 +388,8 @@ impl Backend for Jobs<'_> {
             self.deciding = Lock::try_take(&directory)?;
             match self.ask() {
                 Ok(()) => {
-                    self.adopt()?;
-                    self.give_back()?;
+                    self.report_queued_arrays()?;
+                    self.return_lost_cells()?;
                 }
                 Err(error) if self.answers > 0 => {
                     self.deciding = None;
@@ -394,7 +398,7 @@ impl Backend for Jobs<'_> {
                 Err(error) => return Err(error),
             }
         }
-        Ok(std::mem::take(&mut self.news))
+        Ok(std::mem::take(&mut self.pending_events))
     }
 
     fn free_slots(&self) -> usize {

@@ -11,7 +11,7 @@ use std::{
 const MIN_CLEANUP_LENGTH: usize = 256;
 
 /// A fair queue of entries, each with a number of pixels as its cost. It may be used by several threads.
-pub(super) struct Turns<T> {
+pub(super) struct FairQueue<T> {
     queue: Mutex<Queue<T>>,
     ready: Condvar,
 }
@@ -28,7 +28,7 @@ struct Queue<T> {
     closed: bool,
 }
 
-impl<T> Turns<T> {
+impl<T> FairQueue<T> {
     /// Creates an empty queue.
     pub(super) fn new() -> Self {
         let queue = Queue { waiting: BTreeMap::new(), clock: 0, n_pushed: 0, closed: false };
@@ -82,9 +82,9 @@ mod tests {
     use super::*;
 
     fn order(asked: &[(u64, &'static str)]) -> Vec<&'static str> {
-        let turns = Turns::new();
-        asked.iter().for_each(|&(pixels, name)| turns.push(pixels, name, |_| true));
-        asked.iter().map(|_| turns.pop().unwrap()).collect()
+        let queue = FairQueue::new();
+        asked.iter().for_each(|&(pixels, name)| queue.push(pixels, name, |_| true));
+        asked.iter().map(|_| queue.pop().unwrap()).collect()
     }
 
     #[test]
@@ -94,21 +94,21 @@ mod tests {
 
     #[test]
     fn small_picture_overtakes_waiting_large_ones() {
-        let turns = Turns::new();
-        (0..40).for_each(|i| turns.push(4000, i, |_| true));
-        assert_eq!((turns.pop(), turns.pop()), (Some(0), Some(1)));
-        turns.push(4, 99, |_| true);
-        assert_eq!((turns.pop(), turns.pop()), (Some(99), Some(2)));
+        let queue = FairQueue::new();
+        (0..40).for_each(|i| queue.push(4000, i, |_| true));
+        assert_eq!((queue.pop(), queue.pop()), (Some(0), Some(1)));
+        queue.push(4, 99, |_| true);
+        assert_eq!((queue.pop(), queue.pop()), (Some(99), Some(2)));
     }
 
     #[test]
     fn a_large_picture_is_not_passed_for_ever() {
-        let turns = Turns::new();
-        turns.push(100, "large", |_| true);
+        let queue = FairQueue::new();
+        queue.push(100, "large", |_| true);
         let mut small = 0;
         loop {
-            turns.push(10, "small", |_| true);
-            match turns.pop().unwrap() {
+            queue.push(10, "small", |_| true);
+            match queue.pop().unwrap() {
                 "large" => break,
                 _ => small += 1,
             }
@@ -118,13 +118,13 @@ mod tests {
 
     #[test]
     fn what_nobody_waits_for_goes_and_a_closed_queue_is_empty() {
-        let turns = Turns::new();
+        let queue = FairQueue::new();
         for i in 0..MIN_CLEANUP_LENGTH + 1 {
-            turns.push(1, i, |&item| item >= MIN_CLEANUP_LENGTH - 1);
+            queue.push(1, i, |&item| item >= MIN_CLEANUP_LENGTH - 1);
         }
-        assert_eq!(turns.pop(), Some(MIN_CLEANUP_LENGTH - 1));
-        turns.close();
-        turns.push(1, 0, |_| true);
-        assert_eq!(turns.pop(), None);
+        assert_eq!(queue.pop(), Some(MIN_CLEANUP_LENGTH - 1));
+        queue.close();
+        queue.push(1, 0, |_| true);
+        assert_eq!(queue.pop(), None);
     }
 }

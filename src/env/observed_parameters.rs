@@ -3,7 +3,7 @@
 use super::{Environment, EnvironmentSpec, ParameterSpec};
 
 /// The current parameters of one environment, scaled for observations.
-pub(super) struct SeenParameters {
+pub(super) struct ObservedParameters {
     /// Each parameter, and the index in [`EnvironmentSpec::applied`] of the quantity that reads the parameter back.
     parameters: Vec<(&'static ParameterSpec, usize)>,
     /// A buffer for the values of [`EnvironmentSpec::applied`].
@@ -12,7 +12,7 @@ pub(super) struct SeenParameters {
     entries: Vec<f32>,
 }
 
-impl SeenParameters {
+impl ObservedParameters {
     /// Reads the current parameters of an environment.
     pub(super) fn new(environment: &dyn Environment) -> Self {
         let EnvironmentSpec { parameters, applied, .. } = environment.spec();
@@ -20,13 +20,13 @@ impl SeenParameters {
             let place = applied.iter().position(|quantity| quantity.name == parameter.applied);
             (parameter, place.expect("every parameter is read back; a test checks each"))
         };
-        let mut seen = Self {
+        let mut observed = Self {
             parameters: parameters.iter().map(place).collect(),
             applied: vec![0.0; applied.len()],
             entries: vec![0.0; parameters.len()],
         };
-        seen.read(environment);
-        seen
+        observed.read(environment);
+        observed
     }
 
     /// Updates the entries from the physics. Call this method after the environment's parameters were set.
