@@ -123,18 +123,18 @@ impl Plan {
     /// # Errors
     /// [`PlanError`], which names the study.
     pub fn of_study(name: &str, study: &StudyPlan) -> Result<Self, PlanError> {
-        let beside = |file: &str| {
-            let content = study.beside.get(file).map(|content| content.clone().into_bytes());
+        let read_csv_file = |file: &str| {
+            let content = study.csv_files.get(file).map(|content| content.clone().into_bytes());
             content.ok_or_else(|| format!("`{file}`, which the table does not have"))
         };
-        Self::parse_with(&format!("the study {name}"), study.plan.clone(), Path::new(""), &beside)
+        Self::parse_with(&format!("the study {name}"), study.plan.clone(), Path::new(""), &read_csv_file)
     }
 
     /// Returns the plan with its CSV files, as a results table stores it.
     pub fn for_table(&self) -> StudyPlan {
         let text = |content: &Vec<u8>| String::from_utf8_lossy(content).into_owned();
-        let beside = self.beside.iter().map(|(name, content)| (name.clone(), text(content)));
-        StudyPlan { plan: self.text.clone(), beside: beside.collect() }
+        let csv_files = self.csv_files.iter().map(|(name, content)| (name.clone(), text(content)));
+        StudyPlan { plan: self.text.clone(), csv_files: csv_files.collect() }
     }
 }
 

@@ -136,9 +136,9 @@ fn with_set(spec: &'static EnvironmentSpec, set: DisturbanceSet) -> &'static Env
     address.get_or_init(|| Box::leak(Box::new(disturbed)))
 }
 
-/// Returns the offset of the entry that follows the entry at offset `place`, in a ring buffer of `length` numbers with
+/// Returns the offset of the entry that follows the entry at `offset`, in a ring buffer of `length` numbers with
 /// entries of `width` numbers. A comparison is used, because a remainder would cost a division in each step.
-fn next_offset(place: usize, width: usize, length: usize) -> usize {
-    let next = place + width;
+fn next_offset(offset: usize, width: usize, length: usize) -> usize {
+    let next = offset + width;
     if next < length { next } else { 0 }
 }

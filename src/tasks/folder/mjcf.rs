@@ -102,12 +102,12 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     let documents = sources.iter().map(|(name, text)| parse(name, text)).collect::<Result<Vec<_>>>()?;
     let root = documents[0].root_element();
     check_root(&sources[0].0, &root)?;
-    let parts: Vec<SourceFile<'_>> = sources
+    let source_files: Vec<SourceFile<'_>> = sources
         .iter()
         .zip(&documents)
         .map(|((name, text), document)| SourceFile { name, document, line_ends: line_ends(text) })
         .collect();
-    let folders = Folders::find(&parts);
+    let folders = Folders::find(&source_files);
     let attributes = |element: &str| {
         let all = documents.iter().flat_map(|document| document.descendants());
         let found =
@@ -117,14 +117,14 @@ pub(super) fn read(files: &mut Files, main: &str) -> Result<Mjcf> {
     let (statistic, compiler) = (attributes("statistic"), attributes("compiler"));
     let mut writer = Writer {
         files,
-        parts: &parts,
+        source_files: &source_files,
         folders,
         physics: Text::default(),
         picture: Text::default(),
         physics_names: BTreeMap::new(),
         picture_names: BTreeMap::new(),
     };
-    writer.physics.sources = parts.iter().map(|part| part.name.to_owned()).collect();
+    writer.physics.sources = source_files.iter().map(|source| source.name.to_owned()).collect();
     writer.picture.sources.clone_from(&writer.physics.sources);
     writer.element(0, root, TextTarget::Both, 0)?;
     let Writer { physics, picture, .. } = writer;
@@ -229,9 +229,9 @@ struct Folders {
 }
 
 impl Folders {
-    fn find(parts: &[SourceFile<'_>]) -> Self {
+    fn find(source_files: &[SourceFile<'_>]) -> Self {
         let mut folders = Self::default();
-        let elements = parts.iter().flat_map(|part| part.document.descendants());
+        let elements = source_files.iter().flat_map(|source| source.document.descendants());
         for compiler in elements.filter(|node| node.has_tag_name("compiler")) {
             if let Some(folder) = compiler.attribute("meshdir") {
                 folders.mesh = folder.to_owned();
@@ -268,7 +268,7 @@ enum TextTarget {
 /// Writes the text for the physics and the text for pictures.
 struct Writer<'a> {
     files: &'a mut Files,
-    parts: &'a [SourceFile<'a>],
+    source_files: &'a [SourceFile<'a>],
     folders: Folders,
     physics: Text,
     picture: Text,
@@ -279,8 +279,8 @@ struct Writer<'a> {
 }
 
 impl Writer<'_> {
-    fn element(&mut self, part: usize, node: Node<'_, '_>, target: TextTarget, depth: usize) -> Result<()> {
-        let (name, tag) = (self.parts[part].name, node.tag_name().name());
+    fn element(&mut self, file_index: usize, node: Node<'_, '_>, target: TextTarget, depth: usize) -> Result<()> {
+        let (name, tag) = (self.source_files[file_index].name, node.tag_name().name());
         if depth > MAX_DEPTH {
             return Err(at(name, &node, format_args!("elements are nested more than {MAX_DEPTH} deep")));
         }
@@ -298,7 +298,9 @@ impl Writer<'_> {
                 continue;
             }
             let (value, picture_value) = match file_reference(tag, key) {
-                Some(needed) => self.file(part, &node, attribute.value(), needed && target == TextTarget::Both)?,
+                Some(needed) => {
+                    self.file(file_index, &node, attribute.value(), needed && target == TextTarget::Both)?
+                }
                 None => (attribute.value().to_owned(), attribute.value().to_owned()),
             };
             if key != "material" {
@@ -317,7 +319,7 @@ impl Writer<'_> {
             write_attribute(&mut physics, "name", stem);
             write_attribute(&mut picture, "name", stem);
         }
-        let place = (part, self.parts[part].line(&node));
+        let place = (file_index, self.source_files[file_index].line(&node));
         let children: Vec<Node<'_, '_>> = node.children().filter(Node::is_element).collect();
         let end = if children.is_empty() { "/>" } else { ">" };
         if target == TextTarget::Both {
@@ -325,7 +327,7 @@ impl Writer<'_> {
         }
         self.picture.push(&format!("{picture}{end}"), place);
         for &child in &children {
-            self.element(part, child, target, depth + 1)?;
+            self.element(file_index, child, target, depth + 1)?;
         }
         if !children.is_empty() {
             if target == TextTarget::Both {
@@ -339,18 +341,18 @@ impl Writer<'_> {
     /// Writes the elements of an included file instead of the `<include>` element.
     fn include(&mut self, node: Node<'_, '_>, target: TextTarget, depth: usize) -> Result<()> {
         let file = node.attribute("file").unwrap_or_default().replace('\\', "/");
-        let parts = self.parts;
-        let Some(part) = parts.iter().position(|part| part.name == file) else { return Ok(()) };
-        for child in parts[part].document.root_element().children().filter(Node::is_element) {
-            self.element(part, child, target, depth + 1)?;
+        let source_files = self.source_files;
+        let Some(file_index) = source_files.iter().position(|source| source.name == file) else { return Ok(()) };
+        for child in source_files[file_index].document.root_element().children().filter(Node::is_element) {
+            self.element(file_index, child, target, depth + 1)?;
         }
         Ok(())
     }
 
     /// Reads a file to which an element refers. Returns its name in the text for the physics and in the text for
     /// pictures. Files that only pictures need are read, too, because the hash of the task covers them.
-    fn file(&mut self, part: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
-        let source = &self.parts[part];
+    fn file(&mut self, file_index: usize, node: &Node<'_, '_>, value: &str, needed: bool) -> Result<(String, String)> {
+        let source = &self.source_files[file_index];
         let path = self.folders.path(node.tag_name().name(), value);
         let who = format!("{}, line {}", escaped(source.name), source.line(node));
         let bytes = self.files.read(&path, &who)?;

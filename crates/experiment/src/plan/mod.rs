@@ -27,7 +27,7 @@ use perturb_records::TrainedOn;
 use perturb_records::success::{Criterion, Rule};
 use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
 use perturb_settings::{Method, TrainConfig, ValueError, require};
-use sets::ReadBeside;
+use sets::ReadCsvFile;
 
 /// An experiment file, expanded to cells.
 #[derive(Clone, Debug)]
@@ -40,7 +40,7 @@ pub struct Plan {
     /// The date as written in the file; empty if the file has none.
     pub date: String,
     /// The CSV files that the parameter sets name: content by file name. They are in the folder of the experiment file.
-    pub beside: BTreeMap<String, Vec<u8>>,
+    pub csv_files: BTreeMap<String, Vec<u8>>,
     /// Absolute paths of task folders that locally started servers also serve.
     pub tasks: Vec<PathBuf>,
     /// The requested revisions of environments, as in `perturb/CartPole-v1`. Environments that are not listed may have
@@ -173,9 +173,9 @@ impl Plan {
     /// Returns an empty plan, for reports without an experiment.
     pub fn without_cells() -> Self {
         let (selection, cells, candidates) = (Selection::Paper, Vec::new(), Vec::new());
-        let (text, beside, tasks, revisions) = (String::new(), BTreeMap::new(), Vec::new(), BTreeMap::new());
+        let (text, csv_files, tasks, revisions) = (String::new(), BTreeMap::new(), Vec::new(), BTreeMap::new());
         let (title, date) = Default::default();
-        Self { text, title, date, beside, tasks, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
+        Self { text, title, date, csv_files, tasks, revisions, selection, runs: 0, tuning_runs: 0, cells, candidates }
     }
 
     /// Reads and expands the file at `path`.
@@ -202,8 +202,8 @@ impl Plan {
 
     /// Returns the names and contents of the plan's files: the CSV files that its sets name, then `plan.toml`.
     pub fn files(&self) -> impl Iterator<Item = (&str, &[u8])> {
-        let beside = self.beside.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
-        beside.chain([("plan.toml", self.text.as_bytes())]) // last, because it names the others
+        let csv_files = self.csv_files.iter().map(|(name, content)| (name.as_str(), content.as_slice()));
+        csv_files.chain([("plan.toml", self.text.as_bytes())]) // last, because it names the others
     }
 
     /// Expands `text`, the content of the experiment file at `path`. Files that it names are read from the folder of
@@ -217,7 +217,7 @@ impl Plan {
     }
 
     /// Expands `text`, the content of an experiment file. Errors name it `path`. Task folders are relative to `folder`,
-    /// and `beside` reads the CSV files that the plan names.
+    /// and `read_csv_file` reads the CSV files that the plan names.
     ///
     /// # Errors
     /// [`PlanError`], which names the table and the key.
@@ -225,24 +225,24 @@ impl Plan {
         path: &str,
         text: String,
         folder: &Path,
-        beside: &ReadBeside<'_>,
+        read_csv_file: &ReadCsvFile<'_>,
     ) -> Result<Self, PlanError> {
-        Self::expand(text, folder, beside).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
+        Self::expand(text, folder, read_csv_file).map_err(|reason| PlanError::Refused { path: path.to_owned(), reason })
     }
 
     /// Parses `text`, checks it, and expands it to cells.
-    fn expand(text: String, folder: &Path, read_beside: &ReadBeside<'_>) -> Result<Self, AnyError> {
+    fn expand(text: String, folder: &Path, read_csv_file: &ReadCsvFile<'_>) -> Result<Self, AnyError> {
         let mut file: File = toml::from_str(&text).map_err(|error| words(&error))?;
         let revisions = file.spell()?;
         file.check()?;
-        let mut beside = BTreeMap::new();
+        let mut csv_files = BTreeMap::new();
         let (text, tasks) = tasks::resolve(text, &file.tasks, folder)?;
-        let sets = sets::read(&file.sets, read_beside, &mut beside)?;
+        let sets = sets::read(&file.sets, read_csv_file, &mut csv_files)?;
         let (cells, candidates) = expansion::expand(&file, &sets)?;
         let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
         let title = file.title.unwrap_or_default();
         let date = file.date.map(|date| date.to_string()).unwrap_or_default();
-        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, beside, tasks, text, revisions })
+        Ok(Self { selection, runs, tuning_runs, cells, candidates, title, date, csv_files, tasks, text, revisions })
     }
 
     /// Checks that a server's `environment` has everything that the plan's cells need of it: revision, parameters, and

@@ -17,14 +17,14 @@ const VERSION: &str = "version";
 const FILE: &str = "file";
 
 /// A function that reads a file by name. Its error is a phrase that describes what was found instead of the file.
-pub(super) type ReadBeside<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
+pub(super) type ReadCsvFile<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
 
 /// Returns all versions and the parameter sets in `tables`, by name. Inserts the CSV files that the sets name into
-/// `beside`.
+/// `csv_files`.
 pub(super) fn read(
     tables: &BTreeMap<String, Table>,
-    read_beside: &ReadBeside<'_>,
-    beside: &mut BTreeMap<String, Vec<u8>>,
+    read_csv_file: &ReadCsvFile<'_>,
+    csv_files: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<BTreeMap<String, TestSet>, ValueError> {
     let mut sets = BTreeMap::from(Version::KNOWN.map(|version| (version.to_string(), version.into())));
     for (name, table) in tables {
@@ -34,7 +34,7 @@ pub(super) fn read(
         require(name.parse::<Version>().is_err(), &key, "there already", "another name than D, R, E and R+E")?;
         let expected = "values of some parameters, or left out: it is a version";
         require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
-        let set = read_set(name, table, read_beside, beside)
+        let set = read_set(name, table, read_csv_file, csv_files)
             .map_err(|error| ValueError { what: format!("{key}: {}", error.what), ..error })?;
         sets.insert(name.clone(), set);
     }
@@ -45,8 +45,8 @@ pub(super) fn read(
 fn read_set(
     name: &str,
     table: &Table,
-    read_beside: &ReadBeside<'_>,
-    beside: &mut BTreeMap<String, Vec<u8>>,
+    read_csv_file: &ReadCsvFile<'_>,
+    csv_files: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<TestSet, ValueError> {
     let mut version = Version::D;
     let mut file = None;
@@ -69,13 +69,13 @@ fn read_set(
     let Some(file) = file else { return set_of(name, version, assignments) };
     let expected = "alone: the file's header names the parameters";
     require(assignments.is_empty(), FILE, "beside parameters", expected)?;
-    let content = read_beside(file).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
+    let content = read_csv_file(file).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
     let set = set_of_csv(name, version, &content)?;
-    beside.insert(file.clone(), content);
+    csv_files.insert(file.clone(), content);
     Ok(set)
 }
 
-/// Reads the CSV file `file` in `folder`. The error is a phrase for [`ReadBeside`].
+/// Reads the CSV file `file` in `folder`. The error is a phrase for [`ReadCsvFile`].
 pub(super) fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
         return Err(format!("`{file}`, which is not the name of a file .csv"));

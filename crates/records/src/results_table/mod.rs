@@ -40,8 +40,8 @@ pub struct StudyPlan {
     /// The text of the experiment file.
     pub plan: String,
     /// The contents of the other files to which the experiment file refers, by file name.
-    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
-    pub beside: BTreeMap<String, String>,
+    #[serde(rename = "beside", default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub csv_files: BTreeMap<String, String>,
 }
 
 /// A row of the table: the result of a test, or the failure of a cell, which is a training with its tests.

@@ -34,7 +34,7 @@ fn row(study: &str, cell: &str, tested_on: &str) -> TableRow {
 
 fn table() -> ResultsTable {
     let mut table = ResultsTable::default();
-    let plan = |text: &str| StudyPlan { plan: text.into(), beside: BTreeMap::new() };
+    let plan = |text: &str| StudyPlan { plan: text.into(), csv_files: BTreeMap::new() };
     table.merge("one", plan("runs = 1"), vec![row("one", "a", "D"), row("one", "a", "E"), row("one", "b", "D")]);
     table.merge("two", plan("runs = 2"), vec![row("two", "a", "D")]);
     table
@@ -149,7 +149,7 @@ fn rows_are_chosen_by_their_values_and_grouped() {
 #[test]
 fn groups_with_different_texts_have_different_names() {
     let mut table = ResultsTable::default();
-    let plan = StudyPlan { plan: "runs = 1".into(), beside: BTreeMap::new() };
+    let plan = StudyPlan { plan: "runs = 1".into(), csv_files: BTreeMap::new() };
     let spaced = [("a b", "c"), ("a", "b c")];
     table.merge("one", plan, spaced.map(|(cell, tested_on)| row("one", cell, tested_on)).into());
     let groups = table.choose(None, &[], &["cell".to_owned(), "tested_on".to_owned()]).unwrap();
