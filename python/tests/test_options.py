@@ -257,8 +257,8 @@ def test_a_restore_whose_later_part_is_refused_is_remembered(server: str) -> Non
 
 
 def test_observations_stay_as_they_are(server: str) -> None:
-    for copy in (False, True):
-        envs = make_vec(num_envs=4, copy=copy, server=server)
+    for is_copied in (False, True):
+        envs = make_vec(num_envs=4, copy=is_copied, server=server)
         kept = [envs.reset(seed=1)[0]]
         copies = [kept[0].copy()]
         for _ in range(20):
