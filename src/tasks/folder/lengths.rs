@@ -62,19 +62,19 @@ impl EditedLength {
     }
 }
 
-/// A summand of a number in the text. If `edited_length` is `None`, the summand is `coefficient`. Otherwise
-/// `edited_length` is the index of an [`EditedLength`], and the summand is `coefficient` times
+/// A summand of a number in the text. If `length_index` is `None`, the summand is `coefficient`. Otherwise
+/// `length_index` is the index of an [`EditedLength`], and the summand is `coefficient` times
 /// [`EditedLength::amount`]. The amount is squared if `squared`.
 #[derive(Debug, Clone, Copy)]
 struct Summand {
     coefficient: f64,
-    edited_length: Option<usize>,
+    length_index: Option<usize>,
     squared: bool,
 }
 
 impl Summand {
-    fn new(coefficient: f64, edited_length: Option<usize>) -> Self {
-        Self { coefficient, edited_length, squared: false }
+    fn new(coefficient: f64, length_index: Option<usize>) -> Self {
+        Self { coefficient, length_index, squared: false }
     }
 }
 
@@ -88,14 +88,13 @@ struct EditedNumber {
 
 impl EditedNumber {
     fn value(&self, edited_lengths: &[EditedLength], amounts: &[f64]) -> f64 {
-        let changes = |edited_length: usize| {
-            amounts[edited_length].to_bits() != edited_lengths[edited_length].neutral().to_bits()
-        };
-        if !self.parts.iter().filter_map(|part| part.edited_length).any(changes) {
+        let changes =
+            |length_index: usize| amounts[length_index].to_bits() != edited_lengths[length_index].neutral().to_bits();
+        if !self.parts.iter().filter_map(|part| part.length_index).any(changes) {
             return self.own;
         }
-        let value = |&Summand { coefficient, edited_length, squared }: &Summand| match edited_length
-            .map(|edited_length| amounts[edited_length])
+        let value = |&Summand { coefficient, length_index, squared }: &Summand| match length_index
+            .map(|length_index| amounts[length_index])
         {
             None => coefficient,
             Some(amount) if squared => coefficient * (amount * amount),
@@ -235,16 +234,16 @@ impl<'a, 'input> Editor<'a, 'input> {
     /// Finds the [`EditedLength`] that scales a body. Returns an error if two edited lengths scale the body.
     fn scaling(&self, body: usize) -> Result<Scaling> {
         let mut scaling = Scaling::default();
-        for (edited_length, EditedLength { target, .. }) in self.edited_lengths.iter().enumerate() {
+        for (length_index, EditedLength { target, .. }) in self.edited_lengths.iter().enumerate() {
             let size = match *target {
                 Target::Length(of, _) if of == body => None,
-                Target::Size(of, _) if of == body => Some(edited_length),
+                Target::Size(of, _) if of == body => Some(length_index),
                 _ => continue,
             };
             if scaling.along.is_some() {
-                return Err((self.refuse)(edited_length, "another edit scales this body, too; let one edit do it"));
+                return Err((self.refuse)(length_index, "another edit scales this body, too; let one edit do it"));
             }
-            scaling = Scaling { along: Some(edited_length), size };
+            scaling = Scaling { along: Some(length_index), size };
         }
         Ok(scaling)
     }
@@ -255,10 +254,10 @@ impl<'a, 'input> Editor<'a, 'input> {
         for constraint in self.attributes.elements("connect").chain(self.attributes.elements("weld")) {
             for name in ["body1", "body2"].into_iter().filter_map(|key| constraint.attribute(key)) {
                 let found = bodies.iter().position(|node| node.attribute("name") == Some(name));
-                if let Some(edited_length) = found.and_then(|i| scalings[i + 1].along) {
+                if let Some(length_index) = found.and_then(|i| scalings[i + 1].along) {
                     let problem =
                         format!("an equality constraint names body {name:?}, and its anchor would not follow");
-                    return Err((self.refuse)(edited_length, &problem));
+                    return Err((self.refuse)(length_index, &problem));
                 }
             }
         }
@@ -282,16 +281,16 @@ impl<'a, 'input> Editor<'a, 'input> {
         if carried.is_none() && own.is_none() && shifts == [None; 3] {
             return Ok(());
         }
-        if let Some(edited_length) = shifts.into_iter().flatten().next()
+        if let Some(length_index) = shifts.into_iter().flatten().next()
             && (carried.is_some() || own.is_some())
         {
             let problem = "a length moves this body, too; edit one of both";
-            return Err((self.refuse)(edited_length, problem));
+            return Err((self.refuse)(length_index, problem));
         }
         let position = self.numbers(node, "pos", &[0.0; 3])?;
         let number = |axis: usize| {
             let mut parts = vec![Summand::new(position[axis] + anchor[axis], carried)];
-            parts.extend(shifts[axis].map(|edited_length| Summand::new(1.0, Some(edited_length))));
+            parts.extend(shifts[axis].map(|length_index| Summand::new(1.0, Some(length_index))));
             if anchor[axis] != 0.0 {
                 parts.push(Summand::new(-anchor[axis], own));
             }
@@ -324,16 +323,16 @@ impl<'a, 'input> Editor<'a, 'input> {
             }
         }
         // At constant mass, the inertia that an `<inertial>` element states grows with the square of the size.
-        let (Some(inertial), Some(edited_length)) = (inertial, scaling.along) else { return Ok(()) };
+        let (Some(inertial), Some(length_index)) = (inertial, scaling.along) else { return Ok(()) };
         if scaling.size.is_none() {
             let problem =
                 "the body has <inertial>, whose moments do not follow a length; leave it out, or use field = \"size\"";
-            return Err((self.refuse)(edited_length, problem));
+            return Err((self.refuse)(length_index, problem));
         }
         self.scale(inertial, "pos", &[], scaling.along)?;
         for key in ["diaginertia", "fullinertia"] {
             let own = self.numbers(inertial, key, &[])?;
-            let part = |coefficient: f64| Summand { coefficient, edited_length: scaling.size, squared: true };
+            let part = |coefficient: f64| Summand { coefficient, length_index: scaling.size, squared: true };
             let number = |&own: &f64| EditedNumber { own, parts: vec![part(own)] };
             self.set(inertial, key, own.iter().map(number).collect());
         }
@@ -356,25 +355,25 @@ impl<'a, 'input> Editor<'a, 'input> {
         let radius =
             |edited_length: &EditedLength| matches!(edited_length.target, Target::Radius(of) if Some(of) == geom);
         let radius = self.edited_lengths.iter().position(radius);
-        if let (Some(_), Some(edited_length)) = (radius, size) {
+        if let (Some(_), Some(length_index)) = (radius, size) {
             return Err((self.refuse)(
-                edited_length,
+                length_index,
                 "another edit sets the radius of one of its geoms, too; edit one of both",
             ));
         }
-        let Some(edited_length) = along.or(radius) else { return Ok(()) };
+        let Some(length_index) = along.or(radius) else { return Ok(()) };
         // An edit that affects neither contacts nor the inertia is refused.
         let kind = self.attributes.get(node, "type").unwrap_or("sphere");
         let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
         if none && !touches {
             let problem =
                 "it has no effect: one of its geoms can touch nothing, and its body has an <inertial> of its own";
-            return Err((self.refuse)(edited_length, problem));
+            return Err((self.refuse)(length_index, problem));
         }
         if self.attributes.get(node, "mesh").is_some() || matches!(kind, "mesh" | "hfield" | "plane") {
             if !self.attributes.affects_only_pictures(node) {
                 let problem = "a mesh, a height field or a plane cannot be scaled, and one of its geoms is one";
-                return Err((self.refuse)(edited_length, problem));
+                return Err((self.refuse)(length_index, problem));
             }
             return self.scale(node, "pos", &[], along);
         }
@@ -388,7 +387,7 @@ impl<'a, 'input> Editor<'a, 'input> {
             "capsule" | "cylinder" => self.scale(node, "size", &[wide, along], None),
             _ if size.is_none() => {
                 let problem = format!("the body has a {kind}, which has no length; use field = \"size\"");
-                Err((self.refuse)(edited_length, &problem))
+                Err((self.refuse)(length_index, &problem))
             }
             _ => self.scale(node, "size", &[], size),
         }
@@ -404,12 +403,12 @@ impl<'a, 'input> Editor<'a, 'input> {
         first: &[Option<usize>],
         rest: Option<usize>,
     ) -> Result<()> {
-        let edited_length = |i: usize| first.get(i).copied().unwrap_or(rest);
+        let length_index = |i: usize| first.get(i).copied().unwrap_or(rest);
         let own = self.numbers(node, key, &[])?;
-        if (0..own.len()).all(|i| edited_length(i).is_none() || own[i] == 0.0) {
+        if (0..own.len()).all(|i| length_index(i).is_none() || own[i] == 0.0) {
             return Ok(());
         }
-        let number = |(i, &own): (usize, &f64)| EditedNumber { own, parts: vec![Summand::new(own, edited_length(i))] };
+        let number = |(i, &own): (usize, &f64)| EditedNumber { own, parts: vec![Summand::new(own, length_index(i))] };
         self.set(node, key, own.iter().enumerate().map(number).collect());
         Ok(())
     }

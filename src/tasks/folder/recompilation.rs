@@ -65,7 +65,7 @@ impl Recompilation {
             ));
         }
         let refuse =
-            |edited_length: usize, problem: &str| error(edited_lengths[edited_length].parameter, problem.to_owned());
+            |length_index: usize, problem: &str| error(edited_lengths[length_index].parameter, problem.to_owned());
         let physics = EditedText::new(&mjcf.physics, model, &edited_lengths, mjcf.lacks_visual_geoms, &refuse)?;
         let picture = EditedText::new(&mjcf.picture, model, &edited_lengths, mjcf.lacks_visual_geoms, &refuse)?;
         let own = Self { edited_lengths, physics, picture, files: mjcf.physics.files.clone(), cache: Mutex::default() };

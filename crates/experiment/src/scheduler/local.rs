@@ -300,10 +300,10 @@ mod tests {
         assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
         for (number, id) in ids.iter().enumerate() {
             let orders = std::fs::read_to_string(folder.cell(id).path().join("orders")).unwrap();
-            let order: WorkerJob = serde_json::from_str(&orders).unwrap();
-            assert_eq!(order.cells, [JobCell { cell: id.clone(), retry: None }]);
+            let job: WorkerJob = serde_json::from_str(&orders).unwrap();
+            assert_eq!(job.cells, [JobCell { cell: id.clone(), retry: None }]);
             assert_eq!(
-                order.turn,
+                job.turn,
                 turn(&ids[0], number),
                 "they go around the servers, also if these are more than workers"
             );
@@ -337,7 +337,7 @@ mod tests {
         assert_eq!([&first, &second, &third].map(|id| read(id, "seats")), ["0\n", "1\n", "0\n0\n"]);
         let turns = |id: &str| -> Vec<usize> {
             let orders = read(id, "orders");
-            orders.lines().map(|order| serde_json::from_str::<WorkerJob>(order).unwrap().turn).collect()
+            orders.lines().map(|job| serde_json::from_str::<WorkerJob>(job).unwrap().turn).collect()
         };
         assert_eq!(turns(&second), [turn(&first, 1)]);
         assert_eq!(turns(&third), [turn(&first, 2), turn(&first, 3)]);
@@ -396,8 +396,8 @@ mod tests {
     #[track_caller]
     fn logs_of_a_group(folder: &ExperimentFolder, [first, second]: &[String; 2]) {
         let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
-        let order: WorkerJob = serde_json::from_str(&read(first, "orders")).unwrap();
-        assert_eq!(order.cells.iter().map(|ordered| &ordered.cell).collect::<Vec<_>>(), [first, second]);
+        let job: WorkerJob = serde_json::from_str(&read(first, "orders")).unwrap();
+        assert_eq!(job.cells.iter().map(|it| &it.cell).collect::<Vec<_>>(), [first, second]);
         assert_eq!(read(second, "log.txt"), format!("done together with {first}: see ../{first}/log.txt\n"));
     }
 
