@@ -1,5 +1,5 @@
-//! The state of a saved assessment: recorded tests of a policy, which the Python package wrote. The state is read again when
-//! its files change.
+//! The state of a saved assessment: recorded tests of a policy, which the Python package wrote. The state is read again
+//! when its files change.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};

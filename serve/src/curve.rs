@@ -15,8 +15,8 @@ const MIN_EPISODES_PER_POINT: usize = 10;
 const MIN_SPEED_SECONDS: f64 = 1.0;
 /// Maximum number of different speeds in a curve.
 const MAX_SPEEDS: f64 = 40.0;
-/// Two consecutive parts of the curve count as written to the log at once if the times of their last episodes differ by less
-/// than this. The unit is the time over which the speed is measured.
+/// Two consecutive parts of the curve count as written to the log at once if the times of their last episodes differ by
+/// less than this. The unit is the time over which the speed is measured.
 const SAME_BLOCK_SHARE: f64 = 0.02;
 
 /// The episodes of a growing log, summed up in groups.

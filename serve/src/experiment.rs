@@ -1,4 +1,5 @@
-//! The state of an experiment, which consists of cells: trainings with their tests. It is read again when its files change.
+//! The state of an experiment, which consists of cells: trainings with their tests. It is read again when its files
+//! change.
 
 use std::collections::{HashMap, HashSet};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -23,7 +24,8 @@ const TEST_SHARE: f64 = 0.25;
 /// Time for which the experiment still counts as running after its last running cell was seen. It covers the time
 /// between the end of a cell and the start of the next one.
 const BETWEEN_CELLS: Duration = Duration::from_secs(15);
-/// Pause before an experiment that could not be read is read again, as a multiple of the time that the last attempt took.
+/// Pause before an experiment that could not be read is read again, as a multiple of the time that the last attempt
+/// took.
 const REREAD_FACTOR: u32 = 20;
 
 /// The state of an experiment at the last refresh.

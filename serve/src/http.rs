@@ -166,7 +166,8 @@ async fn curves(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     page(&pages::curves::page(&state.root, &chosen), &RelativeRoot::from_index())
 }
 
-/// Streams the events of the list of all runs. If the query names trainings, streams the events of their curves instead.
+/// Streams the events of the list of all runs. If the query names trainings, streams the events of their curves
+/// instead.
 async fn index_events(
     State(state): State<Arc<AppState>>,
     Extension(peer): Extension<ClientAddress>,
@@ -250,7 +251,8 @@ fn relative_path(uri: &Uri, prefix: &str) -> Option<RelativePath> {
     RelativePath::decode(uri.path().strip_prefix(prefix)?)
 }
 
-/// Returns the trainings that a query names, as in `runs=a,b/c`. Returns at most [`pages::curves::MAX_TRAININGS`] of them.
+/// Returns the trainings that a query names, as in `runs=a,b/c`. Returns at most [`pages::curves::MAX_TRAININGS`] of
+/// them.
 fn chosen_trainings(uri: &Uri) -> Option<Vec<RelativePath>> {
     let names = uri.query()?.strip_prefix("runs=")?;
     names.split(',').take(pages::curves::MAX_TRAININGS).map(RelativePath::decode).collect()

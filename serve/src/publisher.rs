@@ -244,7 +244,8 @@ impl Publisher {
                 tokio::spawn(async move { this.publish_topic(&topic).await })
             })
             .collect();
-        // A timeout is ignored, because `publish_topic` continues in its own task. It sends an error if its load panics.
+        // A timeout is ignored, because `publish_topic` continues in its own task. It sends an error if its load
+        // panics.
         let _ = tokio::time::timeout(BROADCAST_TIMEOUT, futures_util::future::join_all(loads)).await;
     }
 

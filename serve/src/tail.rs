@@ -60,8 +60,8 @@ impl Tail {
         }
         let was_read = self.stamp.is_some();
         let mut bytes = Vec::new();
-        // Reads the context again, and the new bytes after it. If the context differs, the file has been replaced, and is
-        // read from its beginning.
+        // Reads the context again, and the new bytes after it. If the context differs, the file has been replaced, and
+        // is read from its beginning.
         file.seek(SeekFrom::Start(self.offset - self.context.len() as u64))?;
         file.by_ref().take(MAX_READ_BYTES).read_to_end(&mut bytes)?;
         let restarted = !bytes.starts_with(&self.context);

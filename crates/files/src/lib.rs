@@ -63,7 +63,8 @@ pub fn io(action: &'static str, path: &Path) -> impl FnOnce(std::io::Error) -> F
 /// Reads a regular file, which must exist.
 ///
 /// # Errors
-/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
+/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1
+/// GiB.
 pub fn read(path: &Path) -> Result<Vec<u8>> {
     read_if_exists(path)?.ok_or_else(|| io("read", path)(Errno::NOENT.into()))
 }
@@ -80,7 +81,8 @@ pub fn read_toml(path: &Path) -> Result<String> {
 /// Reads a regular file. Returns `None` if it does not exist.
 ///
 /// # Errors
-/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1 GiB.
+/// An error of the operating system, or an error if the path is a pipe or a device, or if the file is longer than 1
+/// GiB.
 pub fn read_if_exists(path: &Path) -> Result<Option<Vec<u8>>> {
     read_plain(path, plain::MAX_BYTES)
 }

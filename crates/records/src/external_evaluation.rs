@@ -60,8 +60,8 @@ pub struct ExternalPolicy {
 /// Metadata of a policy that was not trained by an experiment. The policy's records do not contain these data.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct PolicyMetadata {
-    /// The version (parameter distribution D, R, E or R+E) on which the policy was trained. `None` if unknown, or if the
-    /// policy was trained on other parameters.
+    /// The version (parameter distribution D, R, E or R+E) on which the policy was trained. `None` if unknown, or if
+    /// the policy was trained on other parameters.
     pub trained_on: Option<Version>,
     /// Number of training steps, summed over all environments; `None` if unknown.
     pub timesteps: Option<u64>,
@@ -120,7 +120,8 @@ pub enum ExternalEvaluationError {
     /// There are no policies, the policies are of different environments, or two have the same training distribution.
     #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
-        /// The last clause of the message. It describes the policies that were given, e.g. "they are of CartPole and Pendulum".
+        /// The last clause of the message. It describes the policies that were given, e.g. "they are of CartPole and
+        /// Pendulum".
         got: String,
     },
     /// The folder to write to is not empty.
@@ -313,8 +314,8 @@ impl ExternalEvaluation {
     }
 }
 
-/// Returns the names of the records files that the document `json` lists. Returns an empty set if the document is missing
-/// or cannot be parsed.
+/// Returns the names of the records files that the document `json` lists. Returns an empty set if the document is
+/// missing or cannot be parsed.
 fn records_named_in(json: &Path) -> Result<BTreeSet<String>> {
     let text = read_if_exists(json)?.unwrap_or_default();
     let mut value = serde_json::from_slice(&text).unwrap_or_default();

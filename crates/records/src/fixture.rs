@@ -9,8 +9,8 @@ use perturb_records::{
 };
 use perturb_settings::Observe;
 
-/// Returns an episode of a test on `set`, in the environment with the index `index`. The episode has one requested parameter.
-/// The episode's length and achieved value are `steps`.
+/// Returns an episode of a test on `set`, in the environment with the index `index`. The episode has one requested
+/// parameter. The episode's length and achieved value are `steps`.
 pub fn episode(set: &str, index: u32, requested: f64, steps: u32, success: bool) -> EpisodeRecord {
     EpisodeRecord {
         set: set.into(),

@@ -47,8 +47,8 @@ impl HeatmapOptions {
     }
 }
 
-/// The parameters along the axes of a heatmap, and the version (distribution) from which the other parameters are drawn. Only
-/// heatmaps of the same kind can be compared.
+/// The parameters along the axes of a heatmap, and the version (distribution) from which the other parameters are
+/// drawn. Only heatmaps of the same kind can be compared.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct HeatmapKind {
     /// The names of the parameters along x and along y.
@@ -110,13 +110,13 @@ impl Heatmap {
     /// The name of the test set whose records make up a heatmap.
     pub const SET: &str = "heatmap";
 
-    /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, and y is
-    /// the other parameter that varies. Returns `None` if `set` is not the test set of a heatmap.
+    /// Returns the axes of a heatmap's test set: x is the parameter that varies faster from context to context, and y
+    /// is the other parameter that varies. Returns `None` if `set` is not the test set of a heatmap.
     pub(crate) fn axes_of(set: &TestSet, environment: &proto::Environment) -> Option<[Axis; 2]> {
         let contexts = set.listed();
         let [first, second, ..] = contexts.as_slice() else { return None };
-        // Collects the parameters that vary. The parameter along x varies faster: it already differs between the first two
-        // contexts.
+        // Collects the parameters that vary. The parameter along x varies faster: it already differs between the first
+        // two contexts.
         let (mut varying, mut faster) = (Vec::new(), None);
         for parameter in environment.parameters.iter().filter(|_| set.name == Self::SET) {
             let value = |context: &Context| context.get(&parameter.name).copied();
@@ -154,8 +154,8 @@ impl Heatmap {
         HeatmapKind { parameters: self.axes.clone().map(|axis| axis.name), base: self.base }
     }
 
-    /// Returns the version from which the parameters that are not axes were drawn in a recorded heatmap. Returns `None` if
-    /// the records contain no test of a heatmap.
+    /// Returns the version from which the parameters that are not axes were drawn in a recorded heatmap. Returns `None`
+    /// if the records contain no test of a heatmap.
     pub fn base_of(records: &Records) -> Option<Version> {
         records.about.tests.iter().find(|test| test.set.name == Self::SET).map(|test| test.set.version)
     }
@@ -215,8 +215,8 @@ impl Heatmap {
         Some(Self { points: first.points.iter().enumerate().map(point).collect(), ..about(first) })
     }
 
-    /// Replaces the points by the points in `csv`, a table as CSV that [`heatmap_table`] made. Returns `None` if the new
-    /// points do not fit the axes and the grid.
+    /// Replaces the points by the points in `csv`, a table as CSV that [`heatmap_table`] made. Returns `None` if the
+    /// new points do not fit the axes and the grid.
     pub fn with_points(self, csv: &[u8]) -> Option<Self> {
         let mut reader = csv::Reader::from_reader(csv);
         let rows: Result<Vec<[f64; 4]>, _> = reader.deserialize().collect();

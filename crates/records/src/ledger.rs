@@ -2,8 +2,8 @@
 //! environments, with their seeds and indices. The audit checks that the training drew from the claimed distribution,
 //! and that it never drew from the policy's test sets.
 //!
-//! The audit first finds the training by its seed, and the access tokens of its sessions. The owners of these tokens may
-//! have learned from all parameters that were drawn with these tokens, in any session, before the training ended.
+//! The audit first finds the training by its seed, and the access tokens of its sessions. The owners of these tokens
+//! may have learned from all parameters that were drawn with these tokens, in any session, before the training ended.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -17,8 +17,8 @@ use perturb_settings::Common;
 
 use crate::records::{RecordedTest, Records};
 
-/// The ledgers of one or several servers. Each line of a ledger has a digest that depends on all lines before it, and all
-/// digests were verified.
+/// The ledgers of one or several servers. Each line of a ledger has a digest that depends on all lines before it, and
+/// all digests were verified.
 #[derive(Debug, Default)]
 pub struct Ledgers {
     heads: Vec<Head>,
@@ -39,8 +39,8 @@ pub struct Ledgers {
 struct EnvironmentAddress {
     /// Indices in `drawn` of environments that are still in use.
     open: Vec<usize>,
-    /// Recorded ends of draws that are not yet assigned to environments. They are assigned when there are as many ends as
-    /// environments in `open`.
+    /// Recorded ends of draws that are not yet assigned to environments. They are assigned when there are as many ends
+    /// as environments in `open`.
     ends: Vec<(Option<u64>, Moment)>,
     /// Indices in `drawn` of the environments that ended last.
     closed: Vec<usize>,
@@ -65,8 +65,8 @@ pub struct Head {
 /// The result of auditing one policy.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct Proof {
-    /// The names of the access tokens with which the training drew parameters. `None` stands for a session without a token.
-    /// Empty if no ledger contains the training.
+    /// The names of the access tokens with which the training drew parameters. `None` stands for a session without a
+    /// token. Empty if no ledger contains the training.
     pub tokens: BTreeSet<Option<String>>,
     /// The number of sessions of the training.
     pub sessions: usize,
@@ -87,7 +87,8 @@ struct LedgerLine {
     who: LedgerSession,
 }
 
-/// The time of a line. Lines of one ledger are ordered by their number `n`, and lines of different ledgers by `unix_ms`.
+/// The time of a line. Lines of one ledger are ordered by their number `n`, and lines of different ledgers by
+/// `unix_ms`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Moment {
     ledger: usize,
@@ -231,8 +232,8 @@ impl Ledgers {
     fn record_end(&mut self, address: (SessionId, u64, u32), end: (Option<u64>, Moment)) {
         let address = self.by_address.entry(address).or_default();
         address.ends.push(end);
-        // If no environment is in use, `end` corrects the previous ends: the environments that ended last had drawn more
-        // episodes.
+        // If no environment is in use, `end` corrects the previous ends: the environments that ended last had drawn
+        // more episodes.
         let continued = address.open.is_empty();
         if address.ends.len() < address.open.len() {
             return;
@@ -253,8 +254,8 @@ impl Ledgers {
         }
     }
 
-    /// Audits a policy with its recorded tests. The policy was trained for `episodes` episodes in `environment` with the
-    /// settings `training`.
+    /// Audits a policy with its recorded tests. The policy was trained for `episodes` episodes in `environment` with
+    /// the settings `training`.
     pub fn prove(
         &self,
         training: &Common,

@@ -42,8 +42,8 @@ impl Record {
     }
 }
 
-/// Returns the paper's number for a method in an environment; `None` if the paper has none. For the average over all six
-/// environments, pass "Average" as `environment`.
+/// Returns the paper's number for a method in an environment; `None` if the paper has none. For the average over all
+/// six environments, pass "Average" as `environment`.
 pub fn number(environment: &str, method: &Method, metric: Metric) -> Option<Summary> {
     let record = records().find(|record| record.metric == metric && record.is_of(environment, method))?;
     Some(Summary { mean: record.mean_percent, std: Some(record.std_percent), runs: RUNS })

@@ -42,8 +42,8 @@ pub fn environment_seed(purpose: Purpose, seed: u64, version: Version) -> u64 {
 }
 
 /// Returns for each of the N environments the number of its trials that count. Environment i has context i modulo
-/// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes` episodes.
-/// `contexts` must be at least 1.
+/// `contexts`. Every context gets the same number of episodes, at least 1. In total there are at least `episodes`
+/// episodes. `contexts` must be at least 1.
 fn quotas(episodes: u64, contexts: usize) -> Vec<u64> {
     let each = episodes.div_ceil(contexts as u64).max(1);
     // The 100 environments are divided equally among the contexts. A context gets at least one environment, and at most
@@ -82,8 +82,8 @@ impl TestCollector {
         self.quotas.len()
     }
 
-    /// Adds episodes that have just ended. Ignores all but the last episode of a trial, and trials beyond the number that
-    /// counts in their environment.
+    /// Adds episodes that have just ended. Ignores all but the last episode of a trial, and trials beyond the number
+    /// that counts in their environment.
     pub fn take(&mut self, ended: impl IntoIterator<Item = EndedEpisode>) {
         let Self { quotas, episodes_per_trial, .. } = self;
         let counts = |end: &EndedEpisode| {
@@ -124,8 +124,8 @@ impl TestCollector {
     }
 }
 
-/// Returns the permitted values of all parameters in one context of a set, `[alternatives][parameters]`. Version R+E has
-/// two alternatives, because a trial draws either all parameters from R or all from E. Other versions have one.
+/// Returns the permitted values of all parameters in one context of a set, `[alternatives][parameters]`. Version R+E
+/// has two alternatives, because a trial draws either all parameters from R or all from E. Other versions have one.
 fn permitted_values(environment: &proto::Environment, set: &TestSet, context: &Context) -> Vec<Vec<Distribution>> {
     let region = Region::from_version(environment, set.version, &set.parameters(context));
     let in_order = |values: &region::ParameterBox| {

@@ -17,7 +17,8 @@ pub(crate) const MAX_TRAININGS: usize = 8;
 pub(crate) struct ChartedTraining {
     #[serde(skip)]
     relative: RelativePath,
-    /// The shown name. `kind` has the same value: the script chooses colours by `kind`, so each training has its own colour.
+    /// The shown name. `kind` has the same value: the script chooses colours by `kind`, so each training has its own
+    /// colour.
     id: String,
     kind: String,
     #[serde(skip)]

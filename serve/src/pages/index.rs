@@ -15,8 +15,8 @@ use crate::server_status::ServerStatus;
 /// Maximum number of symbolic links out of the served folder that the page names.
 const MAX_SHOWN_LINKS: usize = 20;
 
-/// The address of a polled perturb-server, and its status or the reason why the last poll failed. `None` before the first
-/// poll.
+/// The address of a polled perturb-server, and its status or the reason why the last poll failed. `None` before the
+/// first poll.
 type PolledServer<'a> = (&'a Address, Option<Result<ServerStatus, String>>);
 
 pub(crate) fn update(root: &Root, index: &Index, server: Option<&PolledServer<'_>>) -> Update {

@@ -225,7 +225,8 @@ fn chart(name: &str, title: &str) -> Markup {
     }
 }
 
-/// Returns the report of a run in a frame. Above it is the part `lag`, a note that is shown while the report is out of date.
+/// Returns the report of a run in a frame. Above it is the part `lag`, a note that is shown while the report is out of
+/// date.
 fn report_frame(relative: &RelativePath, update: &Update) -> Markup {
     let report = format!("/report/{}", relative.encode());
     html! {

@@ -7,8 +7,8 @@ use perturb_settings::{ValueError, require};
 use super::ComparedCondition;
 use crate::records::{Records, RecordsMetadata};
 
-/// Refuses a condition without policies, two conditions with the same name, and an unknown baseline. `conditions` has the
-/// name and the number of policies of each condition.
+/// Refuses a condition without policies, two conditions with the same name, and an unknown baseline. `conditions` has
+/// the name and the number of policies of each condition.
 pub(super) fn names(conditions: &[(&str, usize)], baseline: Option<&str>) -> Result<(), ValueError> {
     require(!conditions.is_empty(), "a comparison", "of nothing", "of at least one condition")?;
     let mut names = BTreeSet::new();

@@ -110,8 +110,8 @@ pub struct ConditionComparison {
     pub differences: Vec<ConditionDifference>,
     /// The result of the whole comparison in words.
     pub verdict: String,
-    /// Whether the tests are rows of a results table, which have counts and means instead of episodes. Then only success
-    /// rates have an interval over episodes.
+    /// Whether the tests are rows of a results table, which have counts and means instead of episodes. Then only
+    /// success rates have an interval over episodes.
     pub from_counts: bool,
 }
 
@@ -283,8 +283,8 @@ fn difference(x: &TestedCondition<'_>, y: &TestedCondition<'_>, set: &str) -> Co
     }
 }
 
-/// Returns the pairs of equal keys, as an index into `x` and an index into `y`, in the order of `x`. Returns `None` unless
-/// `x` and `y` have the same keys, each only once.
+/// Returns the pairs of equal keys, as an index into `x` and an index into `y`, in the order of `x`. Returns `None`
+/// unless `x` and `y` have the same keys, each only once.
 fn pairs(x: &[String], y: &[String]) -> Option<Vec<[usize; 2]>> {
     let distinct: std::collections::BTreeSet<&String> = x.iter().collect();
     if x.len() != y.len() || distinct.len() != x.len() {

@@ -56,7 +56,8 @@ impl TestScores {
     }
 }
 
-/// Returns whether all policies are known to have played the same episodes. Returns false if their addresses are unknown.
+/// Returns whether all policies are known to have played the same episodes. Returns false if their addresses are
+/// unknown.
 pub(super) fn share_episodes(policies: &[TestScores]) -> bool {
     policies.windows(2).all(|two| !two[0].addresses.is_empty() && two[0].addresses == two[1].addresses)
 }

@@ -9,14 +9,14 @@ use super::scores::TestScores;
 use super::{ComparedScore, ConditionComparison, TestedCondition, check, compared};
 use crate::results_table::{SELECTION_TEST, TableRow};
 
-/// A condition whose tests are rows of a results table. Each training (cell of an experiment) that these rows test gives one
-/// policy of the condition. The policies differ only in their seed.
+/// A condition whose tests are rows of a results table. Each training (cell of an experiment) that these rows test
+/// gives one policy of the condition. The policies differ only in their seed.
 #[derive(Clone, Debug)]
 pub struct TableCondition<'a> {
     /// The condition's name. It is freely chosen, but no two conditions may have the same name.
     pub name: String,
-    /// The rows. The comparison ignores rows of failed cells, of tests that select a configuration, and of policies from
-    /// before the end of their training.
+    /// The rows. The comparison ignores rows of failed cells, of tests that select a configuration, and of policies
+    /// from before the end of their training.
     pub rows: Vec<&'a TableRow>,
 }
 
@@ -30,13 +30,13 @@ struct RowTest<'a> {
 /// Compares the scores of conditions in the tests on `sets`. With a `baseline`, compares every other condition with the
 /// condition of this name. Otherwise compares every pair of conditions.
 ///
-/// If `sets` is `None`, compares on every test set that all policies were tested on. If the rows are from several studies,
-/// only versions count, because two studies may call different sets by the same name.
+/// If `sets` is `None`, compares on every test set that all policies were tested on. If the rows are from several
+/// studies, only versions count, because two studies may call different sets by the same name.
 ///
 /// # Errors
-/// [`ValueError`] if a condition has no results, two conditions have the same name, or two policies of a condition have the
-/// same seed. Also if rows are of several environments or models, a policy was not tested on a set of `sets`, or the baseline is
-/// unknown.
+/// [`ValueError`] if a condition has no results, two conditions have the same name, or two policies of a condition have
+/// the same seed. Also if rows are of several environments or models, a policy was not tested on a set of `sets`, or the
+/// baseline is unknown.
 pub fn compare_rows(
     conditions: &[TableCondition<'_>],
     sets: Option<&[String]>,
@@ -67,8 +67,8 @@ pub fn compare_rows(
     Ok(ConditionComparison { from_counts: true, ..compared(&sets, score, baseline, tested) })
 }
 
-/// Returns a condition's tests of policies at the end of their training. If a cell was tested several times on a set during
-/// its training, takes the last test.
+/// Returns a condition's tests of policies at the end of their training. If a cell was tested several times on a set
+/// during its training, takes the last test.
 fn final_tests<'a>(condition: &TableCondition<'a>) -> Vec<RowTest<'a>> {
     let mut places: BTreeMap<(&str, &str, &str), usize> = BTreeMap::new();
     let mut found: Vec<RowTest<'a>> = Vec::new();
@@ -125,9 +125,9 @@ fn differing_columns(one: &TableRow, other: &TableRow) -> Vec<String> {
     if names.is_empty() { vec!["study".into()] } else { names }
 }
 
-/// Returns the sets that every policy was tested on: first versions, then other sets in the order of the first condition.
-/// If the tests are from several studies, returns only versions, because two studies may call different sets by the same
-/// name.
+/// Returns the sets that every policy was tested on: first versions, then other sets in the order of the first
+/// condition. If the tests are from several studies, returns only versions, because two studies may call different sets
+/// by the same name.
 fn common_sets(tests: &[Vec<RowTest<'_>>]) -> Vec<String> {
     let studies: BTreeSet<&str> = tests.iter().flatten().map(|test| test.row.study.as_str()).collect();
     let is_comparable = |set: &str| studies.len() == 1 || set.parse::<Version>().is_ok();

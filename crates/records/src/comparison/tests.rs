@@ -6,8 +6,8 @@ use crate::fixture::{assessed, episode};
 use crate::records::Records;
 use crate::results_table::{SELECTION_TEST, TableRow};
 
-/// Returns records of a policy's tests on D and R. Each test has an episode for each element of `returns`. A return of at
-/// least 5 is a success.
+/// Returns records of a policy's tests on D and R. Each test has an episode for each element of `returns`. A return of
+/// at least 5 is a success.
 fn policy(returns: &[u32]) -> Records {
     let mut records = assessed("agent", "CartPole", &[Some(Version::D)], [1, 1, 1]).policies()[0].records.clone();
     let on = |set: &'static str| {

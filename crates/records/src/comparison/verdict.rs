@@ -14,7 +14,8 @@ impl ConditionDifference {
     }
 }
 
-/// Describes one difference in words. `compared` is the number of differences in the whole comparison that have a p-value.
+/// Describes one difference in words. `compared` is the number of differences in the whole comparison that have a
+/// p-value.
 pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, compared: usize) -> String {
     let (Some(interval), Some(p), Some(corrected)) = (it.seeds_95, it.p, it.p_holm) else {
         return format!("{}: {}", few_seeds_numbers(it, score), few_seeds(it));

@@ -2,8 +2,8 @@
 
 use super::Outcomes;
 
-/// Intended number of episodes in a region. Half of them, 20 episodes, estimate the region's success rate. The estimate is
-/// then a multiple of 1/20.
+/// Intended number of episodes in a region. Half of them, 20 episodes, estimate the region's success rate. The estimate
+/// is then a multiple of 1/20.
 const EPISODES: f64 = 40.0;
 
 impl Outcomes {

@@ -87,8 +87,8 @@ pub fn success_within(outcomes: &Outcomes, place: usize, bins: &[Bin]) -> Vec<Su
     counted
 }
 
-/// Counts the episodes and successes of `outcomes` for each pair of bins of the two parameters with the indices `x` and `y`.
-/// Returns the counts `[Y, X]` as one array. The array is empty if one of the parameters does not vary.
+/// Counts the episodes and successes of `outcomes` for each pair of bins of the two parameters with the indices `x` and
+/// `y`. Returns the counts `[Y, X]` as one array. The array is empty if one of the parameters does not vary.
 pub fn success_within_both(
     outcomes: &Outcomes,
     [x, y]: [usize; 2],

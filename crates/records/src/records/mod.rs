@@ -202,8 +202,8 @@ impl RecordsMetadata {
         Ok(())
     }
 
-    /// Returns two values of an episode. The first is the quantity that the success criterion compares. The second is the
-    /// environment's other quantity, or `None` if both criteria compare the same quantity.
+    /// Returns two values of an episode. The first is the quantity that the success criterion compares. The second is
+    /// the environment's other quantity, or `None` if both criteria compare the same quantity.
     fn achieved(&self, end: &EndedEpisode) -> (Option<f64>, Option<f64>) {
         let text = (end.achieved, self.also.is_some().then_some(end.code_achieved).flatten());
         if self.is_judged_by_code() { (text.1, text.0) } else { text }
@@ -359,8 +359,8 @@ impl ParameterComparison {
         Self::with(&RecordsMetadata::new(environment, String::new(), 1))
     }
 
-    /// Returns the largest relative difference between an episode's requested and applied values. Returns `None` if it is
-    /// within rounding.
+    /// Returns the largest relative difference between an episode's requested and applied values. Returns `None` if it
+    /// is within rounding.
     pub fn difference_beyond_rounding(&self, requested: &[f64], applied: &[f64]) -> Option<Difference> {
         self.largest(requested, applied).filter(Difference::exceeds_tolerance)
     }

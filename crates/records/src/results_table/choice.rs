@@ -64,10 +64,10 @@ impl RowFilter {
 }
 
 impl ResultsTable {
-    /// Returns the rows that all `filters` accept, grouped by their values in the columns or settings `by`. Takes the rows
-    /// of `study`, or of all studies if it is `None`. Groups are in the order of their first row. In the name of a group, a
-    /// number has the form `COLUMN=NUMBER`, and a text stands without its column. A text with spaces, quotes or equals signs
-    /// is quoted.
+    /// Returns the rows that all `filters` accept, grouped by their values in the columns or settings `by`. Takes the
+    /// rows of `study`, or of all studies if it is `None`. Groups are in the order of their first row. In the name of a
+    /// group, a number has the form `COLUMN=NUMBER`, and a text stands without its column. A text with spaces, quotes
+    /// or equals signs is quoted.
     ///
     /// # Errors
     /// [`ValueError`] for an unknown column.

@@ -19,8 +19,8 @@ pub use choice::{NamedRows, RowFilter};
 
 /// Version of the table's columns. Increase it when older programs could misread a table.
 pub const SCHEMA_VERSION: u32 = 1;
-/// The name of the test by which a configuration (settings of the training) is selected. Results and records contain this
-/// name, so no parameter set may have it.
+/// The name of the test by which a configuration (settings of the training) is selected. Results and records contain
+/// this name, so no parameter set may have it.
 pub const SELECTION_TEST: &str = "selection";
 /// The name of the Parquet schema.
 const MESSAGE: &str = "results";
@@ -170,9 +170,9 @@ impl ResultsTable {
         Ok(Some(Self { studies, rows }))
     }
 
-    /// Reads the table that `path` names. `path` has the form FILE.parquet or FILE.parquet/STUDY. Returns the path of the
-    /// file, the table, and the study's name, which is empty if `path` has none. The table may lack this study. Returns
-    /// `None` if no part of `path` is a Parquet file.
+    /// Reads the table that `path` names. `path` has the form FILE.parquet or FILE.parquet/STUDY. Returns the path of
+    /// the file, the table, and the study's name, which is empty if `path` has none. The table may lack this study.
+    /// Returns `None` if no part of `path` is a Parquet file.
     ///
     /// # Errors
     /// [`TableError`] if the table is damaged or too new.

@@ -38,9 +38,9 @@ impl Bootstrapped {
     }
 }
 
-/// Computes the numbers that `statistic` returns for `strata`, each with its percentile interval. The interval is computed
-/// from `resamples` resamples. The statistic must always return the same number of values. Returns `None` if there are no
-/// strata, or if a stratum has no runs.
+/// Computes the numbers that `statistic` returns for `strata`, each with its percentile interval. The interval is
+/// computed from `resamples` resamples. The statistic must always return the same number of values. Returns `None` if
+/// there are no strata, or if a stratum has no runs.
 pub fn bootstrap(
     strata: &[Vec<f64>],
     resamples: usize,

@@ -1,6 +1,7 @@
 //! Means, and confidence intervals of proportions.
 
-/// The 97.5th percentile of the standard normal distribution: half the width of a 95 % interval, in standard deviations.
+/// The 97.5th percentile of the standard normal distribution: half the width of a 95 % interval, in standard
+/// deviations.
 pub(crate) const Z_95: f64 = 1.959_963_984_540_054;
 
 /// Returns the 95 % confidence interval of a proportion after Wilson (1927), for `successes` among `trials`, as (low,

@@ -64,8 +64,8 @@ mod tests {
         assert_eq!(sign_flip_p(&[1.0; 16], 1), 2_f64.powi(-15));
     }
 
-    /// With 17 pairs there are 131 072 combinations of signs. The p-value is estimated from the observed combination and
-    /// 100 000 random ones. The estimate's standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
+    /// With 17 pairs there are 131 072 combinations of signs. The p-value is estimated from the observed combination
+    /// and 100 000 random ones. The estimate's standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
     #[test]
     fn of_many_pairs_random_signs_come_to_the_same() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
@@ -86,8 +86,8 @@ mod tests {
     #[test]
     fn the_smallest_of_many_counts_most() {
         let corrected = holm(&[0.01, 0.04, 0.03, 0.005]);
-        // The sorted p-values are multiplied by 4, 3, 2 and 1: 0.02, 0.03, 0.06 and 0.04. Holm raises the last product to
-        // the one before it, 0.06.
+        // The sorted p-values are multiplied by 4, 3, 2 and 1: 0.02, 0.03, 0.06 and 0.04. Holm raises the last product
+        // to the one before it, 0.06.
         let expected = [0.03, 0.06, 0.06, 0.02];
         assert!(corrected.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-15), "{corrected:?}");
         assert_eq!(holm(&[0.6, 0.9]), [1.0, 1.0]);

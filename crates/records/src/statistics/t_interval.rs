@@ -1,8 +1,8 @@
 //! Confidence intervals and significance tests for means, by Student's t distribution.
 //!
-//! With few runs, a percentile bootstrap gives intervals that are too narrow. On normal data from one environment, its 95 %
-//! interval of a mean covers the true value in 73 % of the cases with three runs, and in 84 % with five. The t interval
-//! covers it in 95 %.
+//! With few runs, a percentile bootstrap gives intervals that are too narrow. On normal data from one environment, its
+//! 95 % interval of a mean covers the true value in 73 % of the cases with three runs, and in 84 % with five. The t
+//! interval covers it in 95 %.
 
 use statrs::distribution::{ContinuousCDF, StudentsT};
 

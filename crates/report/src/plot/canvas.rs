@@ -1,5 +1,5 @@
-//! A canvas that draws texts, lines and areas. All positions and lengths are in units. A unit is a CSS pixel in an SVG, and
-//! several pixels in a PNG.
+//! A canvas that draws texts, lines and areas. All positions and lengths are in units. A unit is a CSS pixel in an SVG,
+//! and several pixels in a PNG.
 
 use plotters::coord::Shift;
 use plotters::prelude::*;
@@ -36,8 +36,8 @@ pub(super) struct LineStyle {
 }
 
 impl LineStyle {
-    /// Returns the style of line `index` of a chart, from 0. Colours repeat after 7 lines and dash patterns after 3, so 21
-    /// lines have different styles.
+    /// Returns the style of line `index` of a chart, from 0. Colours repeat after 7 lines and dash patterns after 3, so
+    /// 21 lines have different styles.
     pub(super) fn nth(index: usize) -> Self {
         Self { colour: LINES[index % LINES.len()], width: 2, dashes: DASHES[index % DASHES.len()] }
     }
@@ -104,8 +104,8 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
     /// Writes a line of text, vertically centred at the position.
     pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
-        // plotters does not centre text exactly. The point of a text that it places at the position is the middle of the
-        // letters in an SVG, and a point above their middle in a PNG. All texts are moved down by one unit.
+        // plotters does not centre text exactly. The point of a text that it places at the position is the middle of
+        // the letters in an SVG, and a point above their middle in a PNG. All texts are moved down by one unit.
         self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
     }
 

@@ -13,8 +13,8 @@ pub(super) const GRID: RGBColor = RGBColor(225, 225, 225);
 /// Colour of frames and ticks.
 pub(super) const FRAME: RGBColor = RGBColor(120, 120, 120);
 
-/// The colours of lines, after Okabe and Ito (2008). Their black is replaced by [`INK`], for which a dark page has another
-/// colour. Their yellow is left out because yellow is hard to see on white.
+/// The colours of lines, after Okabe and Ito (2008). Their black is replaced by [`INK`], for which a dark page has
+/// another colour. Their yellow is left out because yellow is hard to see on white.
 pub(super) const LINES: [RGBColor; 7] = [
     INK,
     RGBColor(0, 114, 178),
@@ -53,8 +53,8 @@ pub(super) fn viridis(share: f64) -> RGBColor {
     RGBColor(r, g, b)
 }
 
-/// Interpolates linearly between the colours `anchors`, which belong to equally spaced values from 0 to 1. Clamps `share` to
-/// this range.
+/// Interpolates linearly between the colours `anchors`, which belong to equally spaced values from 0 to 1. Clamps
+/// `share` to this range.
 fn blend(anchors: &[(u8, u8, u8)], share: f64) -> (u8, u8, u8) {
     let place = share.clamp(0.0, 1.0) * (anchors.len() - 1) as f64;
     let below = (place as usize).min(anchors.len() - 2);
@@ -109,8 +109,8 @@ mod tests {
         }
     }
 
-    /// WCAG requires a contrast of 3 to 1 in graphics. Two colours of the palette have a lower contrast on white. This is
-    /// accepted, because lines also differ in their dashes.
+    /// WCAG requires a contrast of 3 to 1 in graphics. Two colours of the palette have a lower contrast on white. This
+    /// is accepted, because lines also differ in their dashes.
     #[test]
     fn lines_are_seen_on_white_and_on_a_dark_page() {
         let dark = luminance((0x17, 0x1a, 0x1d)); // report/style.css

@@ -42,8 +42,8 @@ impl std::fmt::Display for CurveQuantity {
     }
 }
 
-/// Returns the picture of an environment's training curves, with a panel for each training version. `by` chooses the x axis:
-/// episodes or steps.
+/// Returns the picture of an environment's training curves, with a panel for each training version. `by` chooses the x
+/// axis: episodes or steps.
 pub fn draw_curves(curves: &EnvironmentCurves, quantity: CurveQuantity, by: BudgetAxis) -> Panels {
     let methods = distinct(curves.curves.iter().map(|curve| curve.method.clone()));
     let what = match quantity {

@@ -14,8 +14,8 @@ const MIN_NUMBER_GAP: f64 = 6.0;
 /// Minimum gap between the numbers of the first and the last tick if only these have numbers, in units. It is the width
 /// of a space.
 const MIN_END_GAP: f64 = 4.6;
-/// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. The limit is small,
-/// because another frame may be next to it.
+/// Maximum length by which a number may extend beyond the left or right edge of its frame, in units. The limit is
+/// small, because another frame may be next to it.
 const MAX_OVERHANG: f64 = 2.0;
 /// Maximum number of ticks of an axis.
 const MAX_TICKS: usize = 6;
@@ -164,7 +164,8 @@ mod tests {
 
     use super::*;
 
-    /// The x range is that of MountainCar's force. The widths are those of a panel in rows of one, three and four panels.
+    /// The x range is that of MountainCar's force. The widths are those of a panel in rows of one, three and four
+    /// panels.
     #[rstest]
     #[case(210.0, &["0.005", "0.010"])]
     #[case(85.0, &["0.002", "", "", "", "0.010"])]

@@ -232,8 +232,8 @@ impl HeatmapPanels {
         for (index, (name, (x, y))) in KEY.into_iter().zip(self.key_places().0).enumerate() {
             let (left, above) = (x, top + y + (LINE - SAMPLE.1) / 2.0);
             let corners = [(left, above), (left + SAMPLE.0, above + SAMPLE.1)];
-            // The background of a symbol is a colour of the heatmap, because the symbol's white lines would be invisible on
-            // white.
+            // The background of a symbol is a colour of the heatmap, because the symbol's white lines would be
+            // invisible on white.
             canvas.rectangle(corners, viridis(0.4).filled())?;
             let middle = (left + SAMPLE.0 / 2.0, above + SAMPLE.1 / 2.0);
             match index {

@@ -21,8 +21,8 @@ pub(super) fn round_ticks(range: &Range<f64>, most: usize) -> Vec<(f64, String)>
     let Some((first, last, factor, power)) = steps.into_iter().find_map(multiples) else { return Vec::new() };
     let value = |index: i32| {
         let multiple = (first + f64::from(index)) * factor;
-        // For a negative power, divides by a whole number. This gives the float closest to the decimal text. Multiplying
-        // by a negative power of ten would give rounding errors.
+        // For a negative power, divides by a whole number. This gives the float closest to the decimal text.
+        // Multiplying by a negative power of ten would give rounding errors.
         if power < 0 { multiple / 10_f64.powi(-power) } else { multiple * 10_f64.powi(power) }
     };
     let values: Vec<f64> = (0..=(last - first) as i32).map(value).collect();
@@ -44,8 +44,8 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// Formats a tick. All ticks of the axis are multiples of 10^`power`, which decides on the number of decimals. `largest` is
-/// the largest tick. This tick decides whether all ticks are written in thousands (k) or millions (M).
+/// Formats a tick. All ticks of the axis are multiples of 10^`power`, which decides on the number of decimals.
+/// `largest` is the largest tick. This tick decides whether all ticks are written in thousands (k) or millions (M).
 fn format_tick(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {

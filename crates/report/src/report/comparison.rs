@@ -45,7 +45,8 @@ fn comparison_in(environment: &str, assessed: &[ExternalEvaluation]) -> Option<E
     if agents.len() < 2 {
         return None;
     }
-    // Names a condition after its agent. If an agent has several training distributions, adds the training distribution.
+    // Names a condition after its agent. If an agent has several training distributions, adds the training
+    // distribution.
     let condition = |&(agent, trained_on)| {
         let own = policies.iter().filter(|(name, policy)| (*name, policy.trained_on()) == (agent, trained_on));
         let keyed = own.enumerate().map(|(index, (_, policy))| ((index + 1).to_string(), &policy.records));

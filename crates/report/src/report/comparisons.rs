@@ -18,7 +18,8 @@ const MIN_RUNS: usize = 2;
 /// The name that stands for all environments together.
 const ALL: &str = "all";
 
-/// A comparison of the methods x and y by one metric, over the runs that both methods have in every compared environment.
+/// A comparison of the methods x and y by one metric, over the runs that both methods have in every compared
+/// environment.
 #[derive(Clone, Debug, PartialEq)]
 pub(super) struct MethodComparison {
     /// The environment's name, or [`ALL`].
@@ -175,7 +176,8 @@ mod tests {
         let comparison = compared(&[x.clone(), x.clone(), y.clone(), y]).unwrap();
         assert_eq!((comparison.difference.point, comparison.difference.interval_95), (1.0, Some([1.0, 1.0])));
         assert_eq!((comparison.pairs, comparison.p), (6, 2_f64.powi(-5)));
-        // Each of x's three runs is compared with each of y's three runs. The runs of x are better in 3, 2 and 1 of them.
+        // Each of x's three runs is compared with each of y's three runs. The runs of x are better in 3, 2 and 1 of
+        // them.
         assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
         assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
     }

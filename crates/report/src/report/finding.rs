@@ -26,8 +26,8 @@ impl<'a> Report<'a> {
         rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
     }
 
-    /// Returns a picture for each environment if the page begins with a picture of the average. Otherwise the page already
-    /// begins with a picture of each environment, so returns an empty list.
+    /// Returns a picture for each environment if the page begins with a picture of the average. Otherwise the page
+    /// already begins with a picture of each environment, so returns an empty list.
     pub(super) fn environment_pictures(&self) -> Vec<Picture> {
         if !self.has_average() {
             return Vec::new();
@@ -122,8 +122,8 @@ impl<'a> Report<'a> {
 
 /// Returns a sentence that names the method with the best Extrapolation and the next one, and compares Extrapolation
 /// with Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
-/// they share the first place and none is called best. If a method has a single run, no method is called best either, and
-/// the method's numbers are marked. The random policy is left out, because it has learned nothing.
+/// they share the first place and none is called best. If a method has a single run, no method is called best either,
+/// and the method's numbers are marked. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     // Ranks the methods by Extrapolation.
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
@@ -173,8 +173,8 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     ))
 }
 
-/// Returns a sentence that names the methods whose Extrapolation is 0 only because some scenarios have no success. It also
-/// names these scenarios. Returns an empty text if there are no such methods.
+/// Returns a sentence that names the methods whose Extrapolation is 0 only because some scenarios have no success. It
+/// also names these scenarios. Returns an empty text if there are no such methods.
 fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
     let by = |row: &MethodMetrics<'_>| {
         let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
@@ -201,7 +201,8 @@ fn rounded(points: f64) -> f64 {
     (10.0 * points).round() / 10.0 + 0.0
 }
 
-/// Returns a sentence that says which numbers have no interval, and why. Returns `None` if all numbers have an interval.
+/// Returns a sentence that says which numbers have no interval, and why. Returns `None` if all numbers have an
+/// interval.
 fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let all: Vec<&Bootstrapped> = rows.iter().flat_map(|row| row.means.values()).collect();
     let without: Vec<_> = all.iter().filter(|mean| mean.interval_95.is_none()).collect();

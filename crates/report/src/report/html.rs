@@ -115,7 +115,8 @@ impl ReportBundle<'_> {
     }
 }
 
-/// Renders the page. Results come first. The last section says how the results were made and which pictures are missing.
+/// Renders the page. Results come first. The last section says how the results were made and which pictures are
+/// missing.
 fn page(report: &Report<'_>, finding: &[Markup], sections: &[&Section], missing: &[String]) -> Markup {
     let title = report.title();
     html! {
