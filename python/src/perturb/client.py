@@ -252,7 +252,6 @@ class Client:
         if not all(isinstance(snapshot, bytes) for snapshot in snapshots):
             raise InvalidArgumentError("a snapshot is not of the type bytes; expected what snapshot() returned")
         session = self.session
-        session.require_usable()  # a session that was lost earlier does not begin a restore
         try:
             return session.restore(_bytes(mask), snapshots)
         finally:
