@@ -4,10 +4,9 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 
 /// Returns a command that runs `command` with a limit of file sizes, in blocks of 512 bytes. A write beyond the limit
-/// fails with "File too large".
+/// fails with "File too large", if the program ignores the signal SIGXFSZ, as all of perturb's programs do.
 pub fn with_file_limit(command: &Command, blocks: u32) -> Command {
-    // The trap makes the command ignore the signal SIGXFSZ, which would end it at the limit.
-    let script = "trap '' XFSZ; ulimit -f \"$1\"; shift; exec \"$@\"";
+    let script = "ulimit -f \"$1\"; shift; exec \"$@\"";
     in_shell(command, Command::new("sh").args(["-c", script, "sh", &blocks.to_string()]))
 }
 
@@ -54,7 +53,11 @@ mod tests {
     #[test]
     fn files_do_not_exceed_the_limit() {
         let folder = tempfile::tempdir().expect("a folder");
-        let output = with_file_limit(&writing(folder.path()), 32).output().expect("ended");
+        // Unlike perturb's programs, dd does not ignore the signal SIGXFSZ by itself.
+        let mut ignoring = Command::new("sh");
+        let dd = writing(folder.path());
+        ignoring.args(["-c", "trap '' XFSZ; exec \"$@\"", "sh"]).arg(dd.get_program()).args(dd.get_args());
+        let output = with_file_limit(&ignoring, 32).output().expect("ended");
         let words = String::from_utf8_lossy(&output.stderr);
         assert!(!output.status.success() && words.contains("File too large"), "{words}");
         assert_eq!(std::fs::metadata(folder.path().join("file")).expect("a file").len(), 16 << 10);

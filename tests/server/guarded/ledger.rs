@@ -42,6 +42,17 @@ async fn steps(session: &mut Stream, envs: usize, count: usize) {
 }
 
 #[tokio::test]
+async fn equal_draws_of_successive_environments_are_one_entry() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let request = Open { first_environment_index: 5, ..open("CartPole", 4, 7) };
+    let (mut session, _) = within(Stream::open(&guarded.connect(ANN).await, request)).await.unwrap();
+    within(session.ask(Reset { seeds: vec![11; 4], ..Reset::default() })).await.unwrap();
+    let line = draws(&guarded.directory.path().join("ledger")).pop().unwrap();
+    assert_eq!(line.begins, [DrawStart { seed: 11, index: 5, count: 4, region: 0, episode: 0 }]);
+    assert_eq!(line.ends, [DrawEnd { seed: 7, index: 5, count: 4, episode: Some(0) }]);
+}
+
+#[tokio::test]
 async fn ledger_has_draws_before_they_happen_and_their_ends() {
     let guarded = Guarded::start(&entry("ann", ANN, ""));
     let path = guarded.directory.path().join("ledger");

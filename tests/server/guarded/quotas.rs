@@ -6,7 +6,7 @@ use super::{
 };
 use crate::{
     acting::game::{Game, PLAIN, play},
-    common::server::{Session, channel, client, open, until},
+    common::server::{Session, channel, client, open, parameters, until},
     dm_env_rpc::client::{self as worlds, Agent},
 };
 use bytes::Bytes;
@@ -215,6 +215,16 @@ async fn opens_and_catalogues_cost_as_much_of_the_rate_as_steps() {
     }
     let listings = start.elapsed();
     assert!(listings.as_secs_f64() > 0.5, "{listings:?}");
+    let start = Instant::now();
+    for _ in 0..24 {
+        // Most of the price is for the 64 environments.
+        let mut session = Session::show(&mut connection, Some(ANN)).await.unwrap();
+        session.ask(open("CartPole", 64, 1)).await;
+        session.close();
+        assert_eq!(session.end().await.code(), Code::Ok);
+    }
+    let large_opens = start.elapsed();
+    assert!(large_opens.as_secs_f64() > 0.9, "{large_opens:?}");
 }
 
 #[tokio::test]
@@ -234,4 +244,23 @@ async fn a_rate_bounds_how_fast_the_ledger_grows() {
     let most = 16.0 * RATE as f64 * (seconds + 1.0) + 10_000.0;
     println!("{bytes} bytes in {seconds} s, at most {most}");
     assert!(bytes < most, "{bytes} bytes in {seconds} s");
+}
+
+#[tokio::test]
+async fn a_line_of_the_ledger_costs_by_its_length() {
+    const RATE: u64 = 1_000;
+    let guarded = Guarded::start(&entry("ann", ANN, &format!("max_steps_per_second = {RATE}")));
+    let mut session = session(&guarded, ANN, open("CartPole", 1, 1)).await;
+    let start = Instant::now();
+    for round in 0..20 {
+        // The 64 intervals make a long line of a reset that costs few steps by itself.
+        let low = |i: u32| 0.3 + 0.005 * f64::from(i) + 1e-6 * f64::from(round);
+        let intervals: Vec<(f64, f64)> = (0..64).map(|i| (low(i), low(i) + 0.001)).collect();
+        session.ask(Reset { parameters: parameters(&[("length", &intervals)]), ..Reset::default() }).await;
+    }
+    let seconds = start.elapsed().as_secs_f64();
+    let bytes = std::fs::metadata(guarded.directory.path().join("ledger")).unwrap().len() as f64;
+    // An idle token may run one second's steps at once, and the last request does not wait.
+    let most = 16.0 * RATE as f64 * (seconds + 1.0) + 5_000.0;
+    assert!(bytes > 30_000.0 && bytes < most, "{bytes} bytes in {seconds} s, at most {most}");
 }

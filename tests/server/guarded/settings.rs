@@ -1,18 +1,17 @@
 //! Insecure settings, which are refused before a port is bound, and secure settings.
 
 use super::connect;
-use crate::common::server::{Server, command};
+use crate::{
+    common::server::{Server, command},
+    lifecycle::finished,
+};
 use perturb_faults::certificates::Authority;
 use rstest::rstest;
-use std::{
-    os::unix::fs::PermissionsExt,
-    process::{Command, Stdio},
-    time::Instant,
-};
+use std::{os::unix::fs::PermissionsExt, process::Command, time::Instant};
 
 /// Runs a server that must refuse its settings. Returns its message.
 fn refused(mut command: Command) -> String {
-    let output = command.stdin(Stdio::null()).output().unwrap();
+    let output = finished(&mut command);
     let words = String::from_utf8(output.stderr).unwrap();
     assert_eq!((output.status.code(), output.stdout.len()), (Some(2), 0), "{command:?}: {words}");
     words
@@ -49,6 +48,16 @@ fn a_wrong_guard_is_refused(#[case] flags: &[&str], #[case] part: &str) {
     command.args(["--listen", "tcp://127.0.0.1:0"]).args(flags);
     let words = refused(command);
     assert!(words.contains(part), "{words}");
+}
+
+#[test]
+fn a_large_config_file_is_refused_by_its_size() {
+    let file = tempfile::NamedTempFile::new().unwrap();
+    std::fs::write(file.path(), vec![b'#'; (1 << 20) + 1]).unwrap();
+    let mut command = command();
+    command.args(["--listen", "tcp://127.0.0.1:0", "--config"]).arg(file.path());
+    let words = refused(command);
+    assert!(words.contains("it has 1048577 bytes, expected 1048576 at most"), "{words}");
 }
 
 #[test]

@@ -241,6 +241,11 @@ fn an_invalid_plan_is_refused_with_its_key() {
         ("n_steps = [5, 10]", "num_envs = [5, 10]", "num_envs is in both"),
         ("num_envs = 4", "seed = 4", "[algorithm.settings] seed is 4, but must be left out"),
         ("name = 'ppo'\narchitectures = ['ff']", "name = 'ppo'\narchitectures = []", "(ppo): architectures is empty"),
+        (
+            "[[algorithm]]",
+            "[sets.short]\nlength = [0.3, 0.4]\n[[algorithm]]",
+            "[sets.short]: length is [0.3, 0.4], but must be a value, or a text such as",
+        ),
     ] {
         let message = refusal(from, to);
         assert!(message.contains("small.toml") && message.contains(part), "{to}: {message}");

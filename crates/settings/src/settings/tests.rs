@@ -413,3 +413,16 @@ fn what_is_missing_or_not_toml_is_named() {
     let missing = TrainConfig::load(Some(Path::new("/nonexistent.toml")), &[], Table::new());
     assert!(missing.unwrap_err().to_string().contains("cannot read /nonexistent.toml"));
 }
+
+#[test]
+fn a_list_is_no_set_of_values() {
+    let with =
+        |values: &str| load(Some(&format!("environment = 'CartPole'\n[parameters]\nlength = {values}")), &[], "");
+    for values in ["'0.5..1.0'", "0.5", "'0.3..0.4,0.8..0.9'"] {
+        assert!(with(values).is_ok(), "{values}");
+    }
+    for values in ["[0.5, 1.0]", "[0.5]", "[]"] {
+        let message = with(values).unwrap_err().to_string();
+        assert!(message.contains("parameters.length") && message.contains("a text such as \"0.3..0.4\""), "{message}");
+    }
+}
