@@ -297,7 +297,8 @@ class Session:
                 "look at its log, or give slow environments more time with timeout="
             )
         if what == "mismatch":
-            return ProtocolError(f"{where} answered {kind} with {words}: are both of one version?")
+            remedy = "do the server and this package have the same version?"
+            return ProtocolError(f"{where} answered {kind} with {words}: {remedy}")
         if code == RESOURCE_EXHAUSTED:
             return ServerFullError(f"{where} refused {kind}: {words}")
         if code == OUT_OF_RANGE:
