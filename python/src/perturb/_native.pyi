@@ -139,8 +139,8 @@ class Player:
         self, observations: NDArray[np.float32], rewards: NDArray[np.float32], starts: NDArray[np.bool_]
     ) -> None: ...
 
-# The fields of results.PolicyMetadata: training version, training steps, seed and episodes of the tests, what the policy
-# observed (`state` or `parameters`), and whether the policy was deterministic.
+# The fields of results.PolicyMetadata: training version, training steps, seed and episodes of the tests, what the
+# policy observed (`state` or `parameters`), and whether the policy was deterministic.
 PolicyMetadata: TypeAlias = tuple[str | None, int | None, int, int, str, bool | None]
 
 class Assessment:
