@@ -46,7 +46,9 @@ draws = ["D", "R"]
 EXPIRED = datetime.datetime(2021, 1, 1, tzinfo=datetime.timezone.utc)
 # A length that E can draw, and R cannot.
 EXTREME = {"parameters": {"length": 1.0}}
-NOT_ALLOWED = r'a token of the role "train" may not draw from .* of CartPole: .*; request a region that it may draw from'
+NOT_ALLOWED = (
+    r'a token of the role "train" may not draw from .* of CartPole: .*; request a region that it may draw from'
+)
 
 
 @pytest.fixture(scope="module")
