@@ -67,8 +67,8 @@ def readme(studies):
     texts = []
     for name, (published, clean, paper) in headline(studies).items():
         texts += [
-            f"| {NAMES[name]} | published rule | " + " | ".join(fixed(value[0]) for value in published) + " |",
-            "| | selected on one seed, trained again on five | " + " | ".join(map(spread, clean)) + " |",
+            f"| {NAMES[name]} | paper's rule | " + " | ".join(fixed(value[0]) for value in published) + " |",
+            "| | new trainings | " + " | ".join(map(spread, clean)) + " |",
             "| | paper | " + " | ".join(fixed(value) for value in paper) + " |",
         ]
     _, low, high = headline(studies)["a2c"][0][2]

@@ -107,11 +107,16 @@ impl Demo<'_> {
         writeln!(out, "{}\n", self.comparison_table(&environment.name, &trained).to_text())?;
         writeln!(
             out,
-            "Default is trained and tested on D, Interpolation on R; Extrapolation is the\n\
-             geometric mean of D tested on R, D on E and R on E.\n"
+            "Default is success on D after training on D. Interpolation is success on R\n\
+             after training on R. Extrapolation is the geometric mean of three success\n\
+             rates: on R and on E after training on D, and on E after training on R.\n"
         )?;
         if ["Hopper", "HalfCheetah"].contains(&environment.name.as_str()) {
-            writeln!(out, "The paper's robots ran in another simulator, so compare differences, not numbers.\n")?;
+            writeln!(
+                out,
+                "The paper's robots ran in another simulator. Do not compare the success\n\
+                 rates of the two rows. Compare how much success falls along each row.\n"
+            )?;
         }
         writeln!(out, "{}", conclusion(&trained))?;
         let axes = environment.heatmap_axes.clone();
@@ -304,8 +309,9 @@ fn conclusion(trained: &[DemoPolicy]) -> String {
     let [dd, dr, de] = Version::ALL.map(|test| rate(0, test));
     let [_, rr, re] = Version::ALL.map(|test| rate(1, test));
     format!(
-        "Trained on default physics, a policy that succeeds in {dd:.1} % of its own\n\
-         episodes succeeds in {dr:.1} % where the physics is random, and in {de:.1} %\n\
-         where it is extreme. Trained on random physics, it is {rr:.1} % and {re:.1} %."
+        "Trained on default physics, the policy succeeds in {dd:.1} % of the episodes on\n\
+         default physics, in {dr:.1} % on random physics and in {de:.1} % on extreme physics.\n\
+         Trained on random physics, the policy succeeds in {rr:.1} % of the episodes on\n\
+         random physics and in {re:.1} % on extreme physics."
     )
 }
