@@ -132,13 +132,13 @@ class Studies:
         return {seed: metrics(rate(seed)) for seed in seeds}
 
     def tied(self, study, environment, algorithm, trained_on, seed=1):
-        """Return the cells that share the best result under the published rule: the same success and mean return."""
+        """Return the cells that share the best result under the paper's rule: the same success and mean return."""
         cells = self.finished(study, environment=environment, algorithm=algorithm, trained_on=trained_on, seed=seed)
         best = max(cell.tests[trained_on][:2] for cell in cells)
         return [cell for cell in cells if cell.tests[trained_on][:2] == best]
 
     def published_rule(self, study, environment, algorithm):
-        """Return each metric by the published rule on seed 1: mean, lowest and highest over tied configurations."""
+        """Return each metric by the paper's rule on seed 1: mean, lowest and highest over tied configurations."""
         tied = {version: self.tied(study, environment, algorithm, version) for version in "DR"}
         values = []
         for on_d, on_r in itertools.product(tied["D"], tied["R"]):
