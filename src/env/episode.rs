@@ -211,7 +211,12 @@ impl Episodes {
             for ((value, distribution), parameter) in
                 self.values.iter_mut().zip(&distributions[chosen * n..]).zip(parameters)
             {
-                *value = parameter.draw(distribution, stream.unit());
+                *value = if let Some(fixed) = distribution.fixed_value() {
+                    stream.skip(1);
+                    fixed
+                } else {
+                    parameter.draw(distribution, stream.unit())
+                };
             }
             self.environment.set_parameters(&self.values);
             self.update_observed_parameters();

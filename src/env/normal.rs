@@ -53,29 +53,65 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
     })
 });
 
+/// A number drawn from the ziggurat, before the test whether it is accepted.
+struct Candidate {
+    x: f64,
+    layer: usize,
+    fraction: u64,
+    /// Whether the number is accepted without a further test, in 99 of 100 cases.
+    is_inside: bool,
+}
+
+impl Candidate {
+    #[inline]
+    fn new(layers: &[ZigguratLayer; N_LAYERS], bits: u64) -> Self {
+        let (layer, fraction) = ((bits & 0xFF) as usize, (bits >> 9) & ((1 << 52) - 1));
+        let ZigguratLayer { inside, width, .. } = layers[layer];
+        let size = fraction as i64 as f64 * width;
+        // The sign is set without a branch, since the processor would mispredict half of the branches.
+        let x = f64::from_bits(size.to_bits() | ((bits & 0x100) << 55));
+        Self { x, layer, fraction, is_inside: fraction < inside }
+    }
+}
+
 impl PhiloxStream {
     /// Draws a standard normal number. NumPy's `standard_normal` draws the same number from the same stream, up to
     /// rounding.
     pub fn normal(&mut self) -> f64 {
         loop {
-            let bits = self.next_u64();
-            let (number, fraction) = ((bits & 0xFF) as usize, (bits >> 9) & ((1 << 52) - 1));
-            let layer = &LAYERS[number];
-            let size = fraction as f64 * layer.width;
-            // The sign is set without a branch, since the processor would mispredict half of the branches.
-            let x = f64::from_bits(size.to_bits() | ((bits & 0x100) << 55));
-            if fraction < layer.inside {
-                return x; // in 99 of 100 cases
+            let Candidate { x, layer, fraction, is_inside } = Candidate::new(&LAYERS, self.next_u64());
+            if is_inside {
+                return x;
             }
-            if number == 0 {
+            if layer == 0 {
                 let tail = self.tail();
                 return if fraction & 0x100 == 0 { tail } else { -tail };
             }
-            let above = LAYERS[number - 1].curve;
-            if (above - layer.curve) * self.unit() + layer.curve < libm::exp(-0.5 * x * x) {
+            let (above, below) = (LAYERS[layer - 1].curve, LAYERS[layer].curve);
+            if (above - below) * self.unit() + below < libm::exp(-0.5 * x * x) {
                 return x;
             }
         }
+    }
+
+    /// Draws `N` ≤ 4 standard normal numbers, the same as `N` calls of [`normal`](Self::normal), but faster: usually all
+    /// come from one block of random bits, and are computed without a branch.
+    #[inline]
+    pub fn normals<const N: usize>(&mut self) -> [f64; N] {
+        if let Some(block) = self.peek_block() {
+            let layers = &*LAYERS;
+            let candidates: [Candidate; N] = array::from_fn(|i| Candidate::new(layers, block[i]));
+            if candidates.iter().all(|candidate| candidate.is_inside) {
+                self.skip(N);
+                return candidates.map(|candidate| candidate.x);
+            }
+        }
+        self.normals_one_by_one()
+    }
+
+    #[cold]
+    fn normals_one_by_one<const N: usize>(&mut self) -> [f64; N] {
+        array::from_fn(|_| self.normal())
     }
 
     /// Draws the absolute value of a normal number in the tail, beyond [`EDGE`] (Marsaglia, 1964).

@@ -70,19 +70,24 @@ const ROUNDS: usize = 10;
 #[derive(Debug, Clone)]
 pub struct PhiloxStream {
     key: [u64; 2],
+    /// The counter of `block`. Its first word is 0 as long as no block was computed.
     counter: [u64; 4],
+    /// The last block that was computed: four times 64 random bits.
     block: [u64; 4],
-    used: usize,
+    /// Number of times that 64 bits were drawn or skipped.
+    n_drawn: u64,
 }
 
 impl PhiloxStream {
     /// Creates the stream of an environment for one purpose. `index` is the number of the trial for
     /// [`DrawPurpose::Parameters`], and the number of the episode for all other purposes.
+    #[inline]
     pub fn new(seed: u64, environment_index: u64, purpose: DrawPurpose, index: u64) -> Self {
-        Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], used: 4 }
+        Self { key: [seed, environment_index], counter: [0, index, purpose as u64, 0], block: [0; 4], n_drawn: 0 }
     }
 
     /// Creates the stream for step number `step` of an episode.
+    #[inline]
     pub fn at_step(draw: &Draw, purpose: DrawPurpose, step: u32) -> Self {
         let mut stream = Self::new(draw.seed, draw.environment_index.into(), purpose, draw.episode_index);
         stream.counter[3] = step.into();
@@ -91,13 +96,33 @@ impl PhiloxStream {
 
     /// Draws 64 random bits.
     pub fn next_u64(&mut self) -> u64 {
-        if self.used == self.block.len() {
-            self.counter[0] += 1; // no episode draws 2^64 blocks
-            self.block = philox(self.counter, self.key);
-            self.used = 0;
+        let number = self.n_drawn / 4 + 1;
+        if self.counter[0] != number {
+            self.block = self.block_at(number);
+            self.counter[0] = number;
         }
-        self.used += 1;
-        self.block[self.used - 1]
+        let bits = self.block[(self.n_drawn % 4) as usize];
+        self.n_drawn += 1;
+        bits
+    }
+
+    /// Skips `n` times 64 random bits without computing them.
+    pub fn skip(&mut self, n: usize) {
+        self.n_drawn += n as u64;
+    }
+
+    /// Returns the next four times 64 random bits without drawing them. Returns `None` if they are not one block.
+    #[inline(always)]
+    pub(super) fn peek_block(&self) -> Option<[u64; 4]> {
+        // `bool::then` would not be inlined.
+        if self.n_drawn.is_multiple_of(4) { Some(self.block_at(self.n_drawn / 4 + 1)) } else { None }
+    }
+
+    // Inlined, because arguments and result stay in registers then.
+    #[inline(always)]
+    fn block_at(&self, number: u64) -> [u64; 4] {
+        let [_, index, purpose, step] = self.counter;
+        philox([number, index, purpose, step], self.key)
     }
 
     /// Draws a uniform number in [0, 1): the upper 53 of 64 random bits, divided by 2^53.
@@ -125,6 +150,7 @@ impl PhiloxStream {
     }
 }
 
+#[inline(always)]
 fn philox(mut counter: [u64; 4], mut key: [u64; 2]) -> [u64; 4] {
     for _ in 0..ROUNDS {
         let a = u128::from(MULTIPLIERS[0]) * u128::from(counter[0]);

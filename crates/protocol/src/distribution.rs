@@ -96,6 +96,14 @@ impl Distribution {
         &self.0
     }
 
+    /// Returns the value if the distribution has only one, otherwise `None`.
+    pub fn fixed_value(&self) -> Option<f64> {
+        match *self.0 {
+            [Interval { low, high }] if low == high => Some(low),
+            _ => None,
+        }
+    }
+
     /// Maps `u` in [0, 1) to the value at that fraction of the total length. If `u` is uniform, the value has this
     /// distribution.
     pub fn at(&self, u: f64) -> f64 {

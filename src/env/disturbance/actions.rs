@@ -1,7 +1,8 @@
 //! Disturbs actions: delay, repetition (`action_hold`), noise and scale.
 
-use super::{next_offset, parameters::DisturbanceValues};
+use super::{finite, next_offset, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpec, Draw, DrawPurpose, Error, PhiloxStream};
+use std::mem::replace;
 
 /// Disturbs the actions of one environment on their way to the physics. An action is stored as A numbers: a continuous
 /// action as one number per channel, a discrete action as the index of its choice (A = 1).
@@ -37,6 +38,7 @@ impl ActionPath {
     }
 
     /// Takes the client's action for step number `step`, counted from 0. Returns the disturbed action for the physics.
+    #[inline]
     pub(super) fn apply(
         &mut self,
         values: &DisturbanceValues,
@@ -44,52 +46,48 @@ impl ActionPath {
         step: u32,
         action: Action<'_>,
     ) -> Action<'_> {
-        let choice;
-        let action = match action {
-            Action::Continuous(action) => action,
-            // The index is exact in f32, because there are few choices.
-            Action::Discrete(number) => {
-                choice = [number as f32];
-                &choice
-            }
-        };
-        // `held` becomes the client's action after its delay. If the step repeats the previous action, `held` stays.
-        let width = self.neutral.len();
         let is_held = values.action_hold > 0.0
             && step > 0
             && PhiloxStream::at_step(draw, DrawPurpose::ActionHold, step).unit() < values.action_hold;
-        if values.action_delay == 0 {
-            if !is_held {
-                self.held.copy_from_slice(action);
-            }
-        } else {
-            let place = &mut self.delayed[self.oldest..][..width];
-            if !is_held {
-                self.held.copy_from_slice(place);
-            }
-            place.copy_from_slice(action);
-            self.oldest = next_offset(self.oldest, width, self.delayed.len());
+        let oldest = self.oldest;
+        if values.action_delay > 0 {
+            self.oldest = next_offset(oldest, self.neutral.len(), self.delayed.len());
         }
-        // Noise and scale change only `acting`, so a repeated action gets new noise.
-        self.acting.copy_from_slice(&self.held);
-        match self.space {
-            ActionSpec::Discrete(_) => Action::Discrete(self.acting[0] as u32),
-            ActionSpec::Continuous(channels) => {
-                if values.action_noise > 0.0 {
-                    let mut stream = PhiloxStream::at_step(draw, DrawPurpose::ActionNoise, step);
-                    for (entry, channel) in self.acting.iter_mut().zip(channels) {
-                        let noise = values.action_noise * (channel.high - channel.low) * stream.normal();
-                        *entry = finite(f64::from(*entry) + noise);
-                    }
+        // `held` becomes the client's action after its delay. If the step repeats the previous action, `held` stays.
+        match (action, self.space) {
+            // The index is exact in f32, because there are few choices.
+            (Action::Discrete(choice), _) => {
+                let arrived = self.delayed.get_mut(oldest).map_or(choice as f32, |place| replace(place, choice as f32));
+                if !is_held {
+                    self.held[0] = arrived;
                 }
-                for ((entry, neutral), &scale) in self.acting.iter_mut().zip(&self.neutral).zip(&values.action_scales) {
-                    if scale != 1.0 {
-                        let neutral = f64::from(*neutral);
-                        *entry = finite(neutral + scale * (f64::from(*entry) - neutral));
+                Action::Discrete(self.held[0] as u32)
+            }
+            (Action::Continuous(action), ActionSpec::Continuous(channels)) => {
+                let mut noise =
+                    (values.action_noise > 0.0).then(|| PhiloxStream::at_step(draw, DrawPurpose::ActionNoise, step));
+                for (i, (&action, channel)) in action.iter().zip(channels).enumerate() {
+                    let arrived = self.delayed.get_mut(oldest + i).map_or(action, |place| replace(place, action));
+                    if !is_held {
+                        self.held[i] = arrived;
                     }
+                    // Noise and scale change only `acting`, so a repeated action gets new noise.
+                    let mut acting = self.held[i];
+                    if let Some(stream) = &mut noise {
+                        let [normal] = stream.normals();
+                        let noise = values.action_noise * (channel.high - channel.low) * normal;
+                        acting = finite(f64::from(acting) + noise);
+                    }
+                    let scale = values.action_scales[i];
+                    if scale != 1.0 {
+                        let neutral = f64::from(self.neutral[i]);
+                        acting = finite(neutral + scale * (f64::from(acting) - neutral));
+                    }
+                    self.acting[i] = acting;
                 }
                 Action::Continuous(&self.acting)
             }
+            (Action::Continuous(_), ActionSpec::Discrete(_)) => unreachable!("actions were checked against the space"),
         }
     }
 
@@ -122,9 +120,4 @@ impl ActionPath {
         self.delayed.iter_mut().zip(delayed).for_each(|(to, from)| *to = *from as f32);
         Ok(())
     }
-}
-
-/// Returns the nearest finite f32.
-fn finite(number: f64) -> f32 {
-    number.clamp(f32::MIN.into(), f32::MAX.into()) as f32
 }

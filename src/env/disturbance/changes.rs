@@ -72,14 +72,13 @@ impl ChangingPhysics {
     }
 
     /// Switches to the other set of parameters if there is a change before step number `step`. The state stays the
-    /// same.
-    ///
-    /// # Errors
-    /// [`Error::Snapshot`] if the state is not valid with the other parameters. After an error, the state is undefined.
-    pub(super) fn apply(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> Result<(), Error> {
-        if !(self.is_changing && begins_with_change(values, draw, step)) {
-            return Ok(());
-        }
+    /// same. Returns false if the state is not valid with the other parameters, and is therefore undefined.
+    #[inline]
+    pub(super) fn apply(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) -> bool {
+        !self.is_changing || !begins_with_change(values, draw, step) || self.switch().is_ok()
+    }
+
+    fn switch(&mut self) -> Result<(), Error> {
         self.state.clear();
         self.environment.save(&mut self.state);
         self.is_changed = !self.is_changed;

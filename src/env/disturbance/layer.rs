@@ -57,7 +57,7 @@ impl Disturbed {
         self.steps = 0;
         self.physics.environment.push([0.0; 3]); // clears a push that remained if the last episode diverged
         self.actions.begin(&self.values);
-        self.sensors.begin(&self.values, &self.draw, |out| self.physics.environment.observe(out));
+        self.sensors.begin(&self.values, |out| self.physics.environment.observe(out));
     }
 }
 
@@ -109,7 +109,7 @@ impl Environment for Disturbed {
     }
 
     fn observe(&self, out: &mut [f32]) {
-        out.copy_from_slice(self.sensors.seen());
+        self.sensors.observe(&self.values, &self.draw, self.steps, out);
     }
 
     fn scene(&self) -> Option<Scene> {
@@ -124,20 +124,19 @@ impl Environment for Disturbed {
         {
             self.physics.environment.push(impulse);
         }
-        let transition = match self.physics.apply(&self.values, &self.draw, self.steps) {
-            Ok(()) => self.physics.environment.step(action, reward_terms),
-            Err(_) => {
-                reward_terms.fill(0.0);
-                Transition { terminated: true, goal: false, diverged: true }
-            }
+        let transition = if self.physics.apply(&self.values, &self.draw, self.steps) {
+            self.physics.environment.step(action, reward_terms)
+        } else {
+            reward_terms.fill(0.0);
+            Transition { terminated: true, goal: false, diverged: true }
         };
         self.steps += 1;
-        self.sensors.apply(&self.values, &self.draw, self.steps, |out| self.physics.environment.observe(out));
+        self.sensors.apply(|out| self.physics.environment.observe(out));
         transition
     }
 
-    /// Appends the state of the physics, then the delayed actions, then the delayed observations. The observation that
-    /// the policy sees is not stored: `load` computes it again from the saved numbers and the random stream.
+    /// Appends the state of the physics, then the delayed actions, then the delayed observations. The noise of the
+    /// present observation is not stored: `observe` draws it again from the random stream of its step.
     fn save(&self, out: &mut Vec<f64>) {
         self.physics.save(out);
         self.actions.save(out);
@@ -161,8 +160,7 @@ impl Environment for Disturbed {
         self.physics.load(own)?;
         self.physics.environment.push([0.0; 3]); // clears a push of the replaced episode
         self.actions.load(&self.values, late_actions)?;
-        let address = (&self.draw, self.steps);
-        self.sensors.load(&self.values, address, late_observations, |out| self.physics.environment.observe(out))
+        self.sensors.load(&self.values, late_observations, |out| self.physics.environment.observe(out))
     }
 }
 

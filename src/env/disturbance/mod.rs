@@ -142,3 +142,9 @@ fn next_offset(offset: usize, width: usize, length: usize) -> usize {
     let next = offset + width;
     if next < length { next } else { 0 }
 }
+
+/// Returns the nearest finite f32. NaN stays NaN.
+#[inline]
+fn finite(number: f64) -> f32 {
+    number.clamp(f32::MIN.into(), f32::MAX.into()) as f32
+}

@@ -1,6 +1,6 @@
 //! Disturbs observations: delay, noise and dropout.
 
-use super::{next_offset, parameters::DisturbanceValues};
+use super::{finite, next_offset, parameters::DisturbanceValues};
 use crate::env::{ChannelSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
@@ -11,68 +11,58 @@ pub(super) struct SensorPath {
     exact: Vec<f32>,
     /// The index in `exact` of the first number of the newest observation.
     newest: usize,
-    /// The disturbed observation that the policy sees, `[O]`.
-    seen: Vec<f32>,
 }
 
 impl SensorPath {
     /// Creates the path for observations whose entries are `channels`.
     pub(super) fn new(channels: &'static [ChannelSpec]) -> Self {
-        Self { channels, exact: vec![0.0; channels.len()], newest: 0, seen: vec![0.0; channels.len()] }
+        Self { channels, exact: vec![0.0; channels.len()], newest: 0 }
     }
 
     /// Begins an episode. The callback `observe` writes the first exact observation. The policy sees this observation,
     /// with noise and dropout, until the second observation has passed the delay.
-    pub(super) fn begin(&mut self, values: &DisturbanceValues, draw: &Draw, observe: impl FnOnce(&mut [f32])) {
+    pub(super) fn begin(&mut self, values: &DisturbanceValues, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
         self.exact.resize((values.sensor_delay + 1) * width, 0.0);
         let (first, others) = self.exact.split_at_mut(width);
         observe(first);
         others.chunks_exact_mut(width.max(1)).for_each(|other| other.copy_from_slice(first));
         self.newest = 0;
-        self.update_seen(values, draw, 0);
     }
 
-    /// Adds the exact observation after `steps` steps of the episode. The callback `observe` writes this observation.
-    /// Updates the observation that the policy sees.
-    pub(super) fn apply(
-        &mut self,
-        values: &DisturbanceValues,
-        draw: &Draw,
-        steps: u32,
-        observe: impl FnOnce(&mut [f32]),
-    ) {
+    /// Adds the exact observation after a step. The callback `observe` writes this observation.
+    #[inline]
+    pub(super) fn apply(&mut self, observe: impl FnOnce(&mut [f32])) {
         let width = self.channels.len();
         self.newest = next_offset(self.newest, width, self.exact.len());
         observe(&mut self.exact[self.newest..][..width]);
-        self.update_seen(values, draw, steps);
     }
 
-    /// Returns the disturbed observation that the policy sees, `[O]`.
-    pub(super) fn seen(&self) -> &[f32] {
-        &self.seen
-    }
-
-    /// Computes the observation that the policy sees: the oldest observation in the ring buffer, with noise and
-    /// dropout.
-    fn update_seen(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
+    /// Writes the observation that the policy sees after `steps` steps of the episode to `out`, `[O]`: the oldest
+    /// observation in the ring buffer, with noise and dropout.
+    pub(super) fn observe(&self, values: &DisturbanceValues, draw: &Draw, steps: u32, out: &mut [f32]) {
         let width = self.channels.len();
         let oldest = next_offset(self.newest, width, self.exact.len());
-        self.seen.copy_from_slice(&self.exact[oldest..][..width]);
+        let exact = &self.exact[oldest..][..width];
         if values.sensor_noise > 0.0 {
             let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorNoise, steps);
-            for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
-                let normal = stream.normal();
-                if channel.scale > 0.0 {
-                    let noisy = f64::from(*entry) + values.sensor_noise * channel.scale * normal;
-                    let (low, high) = (channel.low.max(f32::MIN.into()), channel.high.min(f32::MAX.into()));
-                    *entry = noisy.clamp(low, high) as f32;
+            let mut begin = 0;
+            while begin < width {
+                let (channels, exact, out) = (&self.channels[begin..], &exact[begin..], &mut out[begin..]);
+                match width - begin {
+                    1 => add_noise::<1>(&mut stream, values.sensor_noise, channels, exact, out),
+                    2 => add_noise::<2>(&mut stream, values.sensor_noise, channels, exact, out),
+                    3 => add_noise::<3>(&mut stream, values.sensor_noise, channels, exact, out),
+                    _ => add_noise::<4>(&mut stream, values.sensor_noise, channels, exact, out),
                 }
+                begin += 4;
             }
+        } else {
+            out.copy_from_slice(exact);
         }
         if values.sensor_dropout > 0.0 {
             let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorDropout, steps);
-            for (entry, channel) in self.seen.iter_mut().zip(self.channels) {
+            for (entry, channel) in out.iter_mut().zip(self.channels) {
                 let is_lost = stream.unit() < values.sensor_dropout;
                 if is_lost && channel.scale > 0.0 {
                     *entry = 0.0_f64.clamp(channel.low, channel.high) as f32;
@@ -101,7 +91,6 @@ impl SensorPath {
     pub(super) fn load(
         &mut self,
         values: &DisturbanceValues,
-        (draw, steps): (&Draw, u32),
         saved: &[f64],
         observe: impl FnOnce(&mut [f32]),
     ) -> Result<(), Error> {
@@ -112,7 +101,28 @@ impl SensorPath {
         self.newest = saved.len();
         self.exact.iter_mut().zip(saved).for_each(|(to, from)| *to = *from as f32);
         observe(&mut self.exact[self.newest..]);
-        self.update_seen(values, draw, steps);
         Ok(())
+    }
+}
+
+/// Writes `N` entries of an observation with noise to `out`. `sensor_noise` is the standard deviation as a share of
+/// each entry's scale.
+#[inline]
+fn add_noise<const N: usize>(
+    stream: &mut PhiloxStream,
+    sensor_noise: f64,
+    channels: &[ChannelSpec],
+    exact: &[f32],
+    out: &mut [f32],
+) {
+    let (channels, exact, out) = (&channels[..N], &exact[..N], &mut out[..N]);
+    let normals = stream.normals::<N>();
+    for i in 0..N {
+        let ChannelSpec { scale, low, high, .. } = channels[i];
+        let noisy = f64::from(exact[i]) + sensor_noise * scale * normals[i];
+        // NaN fails both comparisons, and stays. `clamp` would be slower, because it checks the bounds.
+        let noisy = if noisy < low { low } else { noisy };
+        let noisy = if noisy > high { high } else { noisy };
+        out[i] = if scale > 0.0 { finite(noisy) } else { exact[i] };
     }
 }

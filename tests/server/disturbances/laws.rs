@@ -102,6 +102,37 @@ fn normal_numbers_are_those_of_numpy() {
 }
 
 #[test]
+fn groups_of_normal_numbers_equal_single_ones() {
+    let (mut singles, mut groups) = (stream(DrawPurpose::SensorNoise, 1), stream(DrawPurpose::SensorNoise, 1));
+    // Groups of one to four numbers begin at every place of a block, and rejected numbers move these places.
+    for _ in 0..20_000 {
+        let mut numbers = Vec::with_capacity(14);
+        numbers.extend(groups.normals::<4>());
+        numbers.extend(groups.normals::<1>());
+        numbers.extend(groups.normals::<4>());
+        numbers.extend(groups.normals::<3>());
+        numbers.extend(groups.normals::<2>());
+        for number in numbers {
+            assert_eq!(number.to_bits(), singles.normal().to_bits());
+        }
+    }
+}
+
+#[test]
+fn skipped_numbers_are_those_that_would_be_drawn() {
+    for n in 0..10 {
+        let (mut drawn, mut skipped) = (stream(DrawPurpose::Push, 1), stream(DrawPurpose::Push, 1));
+        drawn.unit();
+        skipped.unit();
+        for _ in 0..n {
+            drawn.unit();
+        }
+        skipped.skip(n);
+        assert_eq!(drawn.unit().to_bits(), skipped.unit().to_bits(), "{n} numbers");
+    }
+}
+
+#[test]
 fn late_actions_act_after_the_delay() {
     let acted = acted(&mut echo(&[("action_delay", 3.0)]), 20, action);
     assert_eq!(acted[..3], [NEUTRAL; 3]);
