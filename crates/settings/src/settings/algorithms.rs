@@ -10,13 +10,15 @@ use super::{SettingError, is_zero};
 pub enum Schedule {
     /// The learning rate stays constant.
     Constant,
-    /// The learning rate falls linearly, to 0 at the end of the training.
+    /// The learning rate falls linearly with the number of steps. It reaches 0 at the maximum number of steps: the
+    /// budget's episodes times the step limit. A training whose episodes end before the step limit therefore ends at a
+    /// rate above 0. With EPOpt's `update_per_episode`, the rate falls with the number of episodes, to 0 at the budget.
     Linear,
 }
 
 impl Schedule {
-    /// Returns the learning rate at a point of the training. `progress_remaining` is the share of the training that is
-    /// left, from 1 at the start to 0 at the end.
+    /// Returns the learning rate at a point of the training. `progress_remaining` is the share of the maximum number of
+    /// steps (or of the budget's episodes) that is left: 1 at the start, and 0 when nothing is left.
     ///
     /// # Errors
     /// [`SettingError`] if `progress_remaining` is not between 0 and 1.
@@ -38,8 +40,8 @@ pub struct A2cConfig {
     /// Step size of RMSProp, above 0 (default: `7e-4`). A larger value learns faster, but if it is too large the policy
     /// collapses.
     pub learning_rate: f64,
-    /// The schedule of the learning rate: "linear", which falls to 0 over the training, or "constant" (default:
-    /// `"linear"`).
+    /// The schedule of the learning rate: "linear", which falls to 0 over the budget's episodes times the step limit,
+    /// or "constant" (default: `"linear"`).
     pub learning_rate_schedule: Schedule,
     /// T, the number of steps of each environment between two updates, at least 1 (default: `5`). A larger value makes
     /// returns less biased but increases their variance, and makes updates rarer.
@@ -118,8 +120,8 @@ pub struct PpoConfig {
     /// Step size of Adam, above 0 (default: `3e-4`). A larger value learns faster, but if it is too large the policy
     /// collapses.
     pub learning_rate: f64,
-    /// The schedule of the learning rate: "constant", or "linear", which falls to 0 over the training (default:
-    /// `"constant"`).
+    /// The schedule of the learning rate: "constant", or "linear", which falls to 0 over the budget's episodes times the
+    /// step limit (default: `"constant"`).
     pub learning_rate_schedule: Schedule,
     /// T, the number of steps of each environment between two updates, at least 1 (default: `128`).
     pub n_steps: usize,

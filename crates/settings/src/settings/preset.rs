@@ -47,8 +47,9 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
         Base::A2c(a2c) => (a2c.bootstrap_truncation, a2c.vf_coef) = (false, HALF * a2c.vf_coef),
         Base::Ppo(ppo) => {
             (ppo.bootstrap_truncation, ppo.vf_coef, ppo.n_epochs) = (false, HALF * ppo.vf_coef, 10);
-            // Rollouts have an eighth of the steps of rollouts with the preset "perturb". With this interval a line of
-            // the log covers about as many steps. Nothing else depends on this setting.
+            // A rollout of one environment has fewer steps than a rollout with the preset "perturb": an eighth with PPO
+            // FF, a sixteenth with PPO RC and RL²-PPO. With this interval, a line of the log covers a similar number of
+            // steps. Nothing else depends on this setting.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
         Base::Random => {}
