@@ -89,7 +89,7 @@ STUDIES = {
     "[questions/pendulum] |": ("questions/pendulum", None),
     "[questions/acrobot] |": ("questions/acrobot", None),
     "[questions/findings] |": ("questions/findings", None),
-    "[beyond], nine studies |": ("beyond/", None),
+    "[beyond], [nine studies] |": ("beyond/", None),
     "[locomotion] |": ("locomotion", 72),
     "locomotion-rate |": ("locomotion-rate", None),
     "classic |": ("classic", 72),
@@ -162,13 +162,16 @@ def classic_ff(studies):
         for name in ("a2c", "ppo")
     }
     cart_pole = {name: studies.published_rule("classic-ff", "CartPole", name)[2] for name in ("a2c", "ppo")}
-    shown = {name: f"{fixed(mean)} ({fixed(low)} … {fixed(high)})" for name, (mean, low, high) in cart_pole.items()}
+    shown = {
+        name: fill("{:.1f} % on average, {:.1f} % with the worst choice and {:.1f} % with the best", *numbers)
+        for name, numbers in cart_pole.items()
+    }
     paper = {name: fill("{:.1f} ± {:.1f}", *studies.paper("CartPole", FF[name], "Extrapolation")) for name in shown}
     texts += [
         f"Of {grid['a2c']} A2C configurations trained on R with seed 1, {tied['a2c']} reach 100 %",
         f"{tied['ppo']} of {grid['ppo']} PPO configurations tie",
-        f"CartPole's Extrapolation is {shown['a2c']} for A2C and {shown['ppo']} for PPO, beside {paper['a2c']} and "
-        f"{paper['ppo']} in the paper",
+        f"for A2C it is {shown['a2c']}; the paper has {paper['a2c']} %",
+        f"for PPO it is {shown['ppo']}; the paper has {paper['ppo']} %",
         f"belong to one of {tied['a2c']} tied configurations",
     ]
     differences = {name: gains(studies, "classic-ff", method, CLEAN) for name, method in FF.items()}
@@ -183,14 +186,19 @@ def classic_ff(studies):
     papers = [studies.paper_mean(FF["epopt-ppo"], metric) - studies.paper_mean(FF["ppo"], metric) for metric in METRICS]
     texts += [
         fill("A2C is {:.0f}, {:.0f} and {:.0f} points above EPOpt-A2C", *lead),
-        fill("the differences are {:.1f}, {:.1f} and {:.1f} points", *behind),
+        fill("EPOpt-PPO is {:.1f} points behind PPO in Default", behind[0]),
+        fill("and {:.1f} and {:.1f} points ahead in Interpolation and Extrapolation", -behind[1], -behind[2]),
         fill("EPOpt-PPO is {:.1f}, {:.1f} and {:.1f} points ahead", *papers),
     ]
     gap = {name: [published[i][0] - paper[i] for i in range(3)] for name, (published, _, paper) in rows.items()}
     near = [max(abs(gap["a2c"][i]), abs(gap["ppo"][i])) for i in range(3)]
     default, *others = gap["epopt-ppo"]
     texts += [
-        fill("A2C and PPO come within {:.1f}, {:.1f} and {:.1f} points of the paper's four-task averages", *near),
+        fill(
+            "A2C and PPO differ from the paper's four-task averages by at most {:.1f} points in [Default], {:.1f} in "
+            "Interpolation and {:.1f} in Extrapolation",
+            *near,
+        ),
         fill("EPOpt-PPO is {:.0f} points below the paper in Default", -default),
         fill("and {:.0f} and {:.0f} points above it in Interpolation and Extrapolation", *others),
         f"A2C's Interpolation falls from {fixed(rows['a2c'][0][1][0], 0)} to {fixed(fmean(rows['a2c'][1][1]), 0)} %",
@@ -224,7 +232,7 @@ def acrobot(studies):
     best, on_r = fill("{:.1f} ± {:.1f}", *best), fill("{:.1f} ± {:.1f}", *on_r)
     texts.append(f"| the paper, trained on D | | | | {best} | | | | |")
     texts.append(f"| the paper, trained on R | | | | | | {on_r} | | |")
-    texts.append(f"reports {best} % for A2C on Acrobot")
+    texts.append(f"reports a success rate of {best} % for A2C on Acrobot")
     return texts + results_texts.acrobot(studies)
 
 
@@ -286,9 +294,9 @@ def claims(studies):
     behind = [fmean(clean["epopt-ppo"][i]) - fmean(clean["ppo"][i]) for i in range(3)]
     papers = [studies.paper_mean(FF["epopt-ppo"], metric) - studies.paper_mean(FF["ppo"], metric) for metric in METRICS]
     texts.append(
-        f"PPO is {fixed(behind[1])} points behind EPOpt-PPO in Interpolation and {fixed(behind[2])} points in "
+        f"EPOpt-PPO is ahead of PPO by {fixed(behind[1])} points in Interpolation and {fixed(behind[2])} points in "
         "Extrapolation. Neither difference is significant after Holm's correction. "
-        f"In the paper PPO is {fixed(papers[1])} and {fixed(papers[2])} points behind"
+        f"The paper's own numbers also have EPOpt-PPO ahead, by {fixed(papers[1])} and {fixed(papers[2])} points"
     )
     strata = {name: gains(studies, "questions/findings", method, seeds) for name, method in FF.items()}
     corrected = holm([p_of(each) for each in strata.values()])
@@ -424,10 +432,10 @@ def rl2(studies):
         return [mine - theirs for mine, theirs in pair]
 
     better, worse = ahead("CartPole", "A2C FF"), ahead("CartPole", "A2C RC")
-    texts.append(f"better than A2C FF by {fixed(min(better))} to {fixed(max(better))} points in each seed")
+    texts.append(f"better than A2C FF with every seed, by {fixed(min(better))} to {fixed(max(better))} points")
     texts.append(
-        f"better than A2C RC by {fixed(fmean(worse))} points (by seed: {fixed(min(worse))} to {fixed(max(worse))} "
-        "points)"
+        f"better than A2C RC by {fixed(fmean(worse))} points, but not with every seed ({fixed(min(worse))} to "
+        f"{fixed(max(worse))} points)"
     )
     behind = [[-number for number in ahead("Pendulum", other)] for other in ("A2C FF", "A2C RC")]
     texts.append(
@@ -462,7 +470,7 @@ def locomotion(studies):
             numbers = [cell.success(tested) for cell in cells]
             table[trained + tested] = numbers
             row.append(f"{spread(numbers)} ({', '.join(f'{fixed(number, 0)}' for number in numbers)})")
-        texts.append(f"| {trained} | " + " | ".join(row) + " |")
+        texts.append(f"| PPO trained on {trained} | " + " | ".join(row) + " |")
     extrapolation = [cube_root(a * b * c) for a, b, c in zip(table["DR"], table["DE"], table["RE"], strict=True)]
     texts.append(
         f"Default is {spread(table['DD'])}, Interpolation {spread(table['RR'])}, Extrapolation {spread(extrapolation)}"
@@ -479,7 +487,7 @@ def locomotion(studies):
     rates = {cell.settings["learning_rate"]: cell.tests["D"][1] for cell in studies.finished("locomotion-rate")}
     pairs = zip(table["RR"], table["DR"], strict=True)
     (exception,) = [fill("{:.0f} % trained on R, {:.0f} % trained on D", *pair) for pair in pairs if pair[0] < pair[1]]
-    texts.append(f"With the third seed it is worse ({exception})")
+    texts.append(f"With the third seed they are worse ({exception})")
     texts.append(
         f"The mean return was {fixed(rates[2e-3], 0)} with a rate of 2e-3, {fixed(rates[7e-4], 0)} with a rate of 7e-4 "
         f"and {fixed(rates[2e-4], 0)} with a rate of 2e-4"

@@ -21,9 +21,8 @@ def acrobot(studies):
     # With one environment and five steps, most seeds fail.
     low, high = min(deviations[1:]), max(deviations[1:])
     return [
-        f"the same with {updates[0]} updates (rollouts of five steps) and with {updates[1]} updates (fifteen steps). "
-        f"With {updates[2]} updates it is one point lower. "
-        f"With {updates[3]} updates, as with our default settings",
+        f"about the same with {updates[0]} updates (rollouts of five steps) and with {updates[1]} updates (fifteen "
+        f"steps). With {updates[2]} updates it is one point lower. With {updates[3]} updates (",
         f"the standard deviation over seeds is {fixed(low, 0)} to {fixed(high, 0)} points",
     ]
 
@@ -53,8 +52,9 @@ def beyond(studies, confirm, first):
     return [
         f"{len(searched)} trainings",
         f"{slower} trainings start at 5e-4",
-        fill("gained {:.1f} points in Default and lost {:.1f} and {:.1f} in", gained[0], -gained[1], -gained[2]),
-        f"reach up to {fixed(best_on_pendulum(studies), 0)} % in Extrapolation",
+        fill("is {:.1f} points better than in this table in Default", gained[0]),
+        fill("and {:.1f} and {:.1f} points worse in Interpolation and Extrapolation", -gained[1], -gained[2]),
+        f"reaches up to {fixed(best_on_pendulum(studies), 0)} % in Extrapolation",
     ]
 
 
@@ -127,6 +127,7 @@ def cart_pole(studies):
     bare = {rate: cells_on_d(studies, "ppo", rate, normalize_observations=False) for rate in (3e-4, 3e-3)}
     kept = [*weights.values(), *ppo.values()]
     falls = {version: [mean(cells, version, 1000) - mean(cells, version) for cells in kept] for version in "DE"}
+    early = [mean(cells, "E", 1000) for cells in kept]
     plain = studies.finished("questions/cart-pole", algorithm="a2c", normalize_observations=False, trained_on="D")
     late = [fmean(mean(cells, "E") for cells in each.values()) for each in (ppo, bare)]
     seeds = [sorted(cell.success("E") for cell in weights[weight]) for weight in (1e-4, 1e-5)]
@@ -139,21 +140,22 @@ def cart_pole(studies):
     *some, last = orders(studies)
     return [
         f"{len({cell.cell for cell in studies.cells if cell.study == 'questions/cart-pole'})} trainings",
-        f"A2C {paper['a2c']} and PPO {paper['ppo']} in Extrapolation",
-        f"the first of the tied ones has Extrapolation {spread(first['a2c'])} for A2C and "
-        f"{spread(first['ppo'])} for PPO",
+        f"Extrapolation on CartPole: {paper['a2c']} % for A2C and {paper['ppo']} % for PPO",
+        "With the order of our experiment file, Extrapolation is "
+        f"{spread(first['a2c'])} for A2C and {spread(first['ppo'])} for PPO",
         "have 100.0 % on D",
         f"Their success on E ranges from {fixed(min(on_e), 0)} to {fixed(max(on_e), 0)} %",
         f"A2C's Extrapolation is {', '.join(some)} or {last}",
         f"The paper's {paper['a2c'].split()[0]} lies among these numbers",
+        f"On E they succeed in {fixed(min(early), 0)} to {fixed(max(early), 0)} %",
         f"success on E falls by {fixed(min(falls['E']), 0)} to {fixed(max(falls['E']), 0)} points, and on D by up to "
         f"{fixed(max(falls['D']), 0)} points",
         f"PPO's success on E rises from {fixed(mean(bare[3e-4], 'E', 1000), 0)} to {fixed(mean(bare[3e-4], 'E'), 0)} % "
         f"at a rate of 3e-4, and changes from {fixed(mean(bare[3e-3], 'E', 1000), 0)} to "
         f"{fixed(mean(bare[3e-3], 'E'), 0)} % at a rate of 3e-3",
-        f"after 1 000 episodes has {fixed(mean(normalised, 'E', 1000), 0)} % with and "
+        f"A2C's success on E is {fixed(mean(normalised, 'E', 1000), 0)} % with normalisation and "
         f"{fixed(mean(plain, 'E', 1000), 0)} % without it",
-        f"({fixed(late[0], 0)} % with, {fixed(late[1], 0)} % without)",
+        f"its success on E is {fixed(late[0], 0)} % with normalisation and {fixed(late[1], 0)} % without it",
         f"success on E is about {shown[1e-5]} % with a weight of 1e-4 or of 1e-5. With each of these two weights, four "
         f"seeds have {fixed(least, 0)} to {fixed(most, 0)} %, and the fifth has about {fixed(failed, 0)} %. Success on "
         f"E is {shown[1e-3]} % with a weight of 1e-3, our default, and {shown[1e-2]} % with a weight of 1e-2",
