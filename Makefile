@@ -143,7 +143,7 @@ install-recurrent: recurrent install ## install perturb-recurrent too, which tra
 	install -D --target-directory $(PREFIX)/bin $(PROGRAMS)/perturb-recurrent
 	strip $(PREFIX)/bin/perturb-recurrent
 
-demo: build opengl ## train Hopper on default and on random physics, and see what still works; minutes
+demo: build opengl ## train Hopper on default and on random physics, and see what still works; a minute after compiling
 	$(PROGRAMS)/perturb demo $(DEMO_ARGS)
 
 all-pairs: recurrent ## train and test every algorithm and architecture on every environment, shortly

@@ -268,12 +268,12 @@ impl Demo<'_> {
 /// Returns the default number of training episodes in an environment, and the settings that differ from the defaults.
 ///
 /// CartPole has a high learning rate, as in experiments/quick.toml. With default settings a policy that was trained on
-/// D succeeds on all versions, so training on R would show no improvement. Hopper needs half as many episodes with more
+/// D succeeds on all versions, so training on R would show no improvement. Hopper needs fewer episodes with more
 /// minibatches, and a falling learning rate prevents its policy from getting worse at the end.
 fn budget(environment: &str) -> (u64, &'static [&'static str]) {
     match environment {
         "CartPole" => (1500, &["learning_rate=3e-3"]),
-        "Hopper" => (2500, &["n_minibatches=8", "learning_rate_schedule=linear"]),
+        "Hopper" => (1500, &["n_minibatches=8", "learning_rate_schedule=linear"]),
         _ => (5000, &[]),
     }
 }

@@ -32,7 +32,7 @@ pub use training::{CompletionsArgs, DemoArgs, EnvsArgs, LsArgs, ManArgs, ServeAr
     name = "perturb",
     version,
     after_help = "Examples:
-  perturb demo                                         # an introduction of a few minutes
+  perturb demo                                         # an introduction of about a minute
   perturb train --env Hopper --version R               # then: perturb evaluate, heatmap, video
   perturb run experiments/quick.toml --out runs/quick  # an experiment; then: perturb report runs/quick
 Exit status: 0 success; 1 failure; 2 an argument or file is missing or wrong; 128 + N ended by signal N."

@@ -103,7 +103,7 @@ pub struct TrainArgs {
     pub play: PlayArgs,
 }
 
-/// Takes one to two minutes on two cores with the default options.
+/// Takes about a minute on two cores with the default options.
 #[derive(Args, Debug)]
 #[command(after_help = "Examples:
   perturb demo
@@ -113,7 +113,7 @@ pub struct DemoArgs {
     /// Name of the environment.
     #[arg(long, value_name = "NAME", default_value = "Hopper")]
     pub env: String,
-    /// Number of episodes of each training [default: 5000; Hopper 2500, CartPole 1500].
+    /// Number of episodes of each training [default: 5000; Hopper and CartPole 1500].
     #[arg(long, value_name = "N", value_parser = at_least_one::<u64>)]
     pub episodes: Option<u64>,
     /// Number of episodes of each test.
