@@ -341,7 +341,11 @@ RECURRENT = {"A2C FF": FF["a2c"], "A2C RC": ("a2c", "rc", None), "PPO FF": FF["p
 
 
 def one_seed(studies, task, method, digits=1, seed=2, trained_on=None):
-    """Return a seed's three metrics, or with `trained_on` the success of the policy trained on this version."""
+    """Return a seed's three metrics in the study classic-rc as text: "Default / Interpolation / Extrapolation".
+
+    With `trained_on`, return the success on D, R and E of the policy that was trained on this version. Missing numbers
+    are left out. Return "" if the study has no such cell.
+    """
     if trained_on is None:
         found = studies.by_seed("classic-rc", task, method).get(seed)
     else:
@@ -351,7 +355,7 @@ def one_seed(studies, task, method, digits=1, seed=2, trained_on=None):
     if found is None:
         return ""
     text = " / ".join("" if number is None else fixed(number, digits) for number in found)
-    return re.sub(r"( / )+$", " /", text)
+    return re.sub(r"( / )+$", " /", text)  # missing numbers at the end leave a single slash
 
 
 def papers(studies, task, method):
