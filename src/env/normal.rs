@@ -54,7 +54,7 @@ static LAYERS: LazyLock<[ZigguratLayer; N_LAYERS]> = LazyLock::new(|| {
 });
 
 /// A number drawn from the ziggurat, before the test whether it is accepted.
-struct Candidate {
+struct ZigguratDraw {
     x: f64,
     layer: usize,
     fraction: u64,
@@ -62,7 +62,7 @@ struct Candidate {
     is_inside: bool,
 }
 
-impl Candidate {
+impl ZigguratDraw {
     #[inline]
     fn new(layers: &[ZigguratLayer; N_LAYERS], bits: u64) -> Self {
         let (layer, fraction) = ((bits & 0xFF) as usize, (bits >> 9) & ((1 << 52) - 1));
@@ -79,7 +79,7 @@ impl PhiloxStream {
     /// rounding.
     pub fn normal(&mut self) -> f64 {
         loop {
-            let Candidate { x, layer, fraction, is_inside } = Candidate::new(&LAYERS, self.next_u64());
+            let ZigguratDraw { x, layer, fraction, is_inside } = ZigguratDraw::new(&LAYERS, self.next_u64());
             if is_inside {
                 return x;
             }
@@ -100,10 +100,10 @@ impl PhiloxStream {
     pub fn normals<const N: usize>(&mut self) -> [f64; N] {
         if let Some(block) = self.peek_block() {
             let layers = &*LAYERS;
-            let candidates: [Candidate; N] = array::from_fn(|i| Candidate::new(layers, block[i]));
-            if candidates.iter().all(|candidate| candidate.is_inside) {
+            let draws: [ZigguratDraw; N] = array::from_fn(|i| ZigguratDraw::new(layers, block[i]));
+            if draws.iter().all(|draw| draw.is_inside) {
                 self.skip(N);
-                return candidates.map(|candidate| candidate.x);
+                return draws.map(|draw| draw.x);
             }
         }
         self.normals_one_by_one()
