@@ -23,9 +23,9 @@ pub trait Algorithm: Send {
     /// Returns the amount of experience to collect between two updates.
     fn collect_until(&self) -> CollectUntil;
 
-    /// Improves `policy` from a finished rollout. `progress_remaining` falls from 1 at the start of training to 0 at
-    /// its end. Returns an error if a loss or gradient is not finite; the policy then has the weights from before that
-    /// gradient step.
+    /// Improves `policy` from a finished rollout. `progress_remaining` falls from 1 at the start of training. It may end
+    /// above 0, see `Schedule::Linear`. Returns an error if a loss or gradient is not finite; the policy then has the
+    /// weights from before that gradient step.
     fn update(
         &mut self,
         policy: &mut TrainablePolicy,

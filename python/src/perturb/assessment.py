@@ -150,8 +150,8 @@ class Assessment:
 
         Contexts with equal success rates are ordered by mean return, lowest first. If the test set is a list or a grid,
         the contexts are those of the list or grid. If parameters are drawn, each context is a region of the parameter
-        space with about 40 episodes. Then the same episodes both select the worst regions and measure them, so these
-        regions look worse than they are. `Result.worst_contexts_percent` does not have this bias.
+        space with about 40 episodes. In all three cases the same episodes both select the worst contexts and measure
+        them, so these contexts look worse than they are. `Result.worst_contexts_percent` does not have this bias.
 
         Args:
             scenario: such as `DE`.

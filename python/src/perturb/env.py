@@ -44,7 +44,7 @@ class PerturbEnv(CheckedAttributes, gymnasium.Env[NDArray[np.float32], Any]):
         episodes_per_trial: the number of episodes after which parameters are drawn again.
         observe: `state`, or `parameters` to append the episode's parameters to observations. They are scaled so that
             the range of R and E together becomes -1 … 1.
-        receipts: whether infos have the keys `parameters` and `receipt`.
+        receipts: whether infos have the keys `parameters`, `receipt` and `context_id`.
         reward_terms: whether the info of each step has the terms of the reward.
         timeout: maximum time to wait for a reply, s.
         render_mode: `rgb_array` to make `render` available, or None.

@@ -50,7 +50,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         episodes_per_trial: the number of episodes after which parameters are drawn again.
         observe: `state`, or `parameters` to append the episode's parameters to observations. They are scaled so that
             the range of R and E together becomes -1 … 1.
-        receipts: whether infos have the keys `parameters` and `receipt`.
+        receipts: whether infos have the keys `parameters`, `receipt` and `context_id`.
         reward_terms: whether the infos of each step have the terms of the reward.
         copy: has no effect. It exists because Gymnasium's own vector environments have it. Callers may always keep and
             change observations and pictures.
