@@ -52,7 +52,6 @@ GIVEN = {
         r"an entropy weight of 0\.01",
         r"the last 100 episodes",
         r"a Default below 90",
-        r"ends at some 40 %",
     ],
     "docs/findings/cart-pole-ties.md": [
         # From the plan.

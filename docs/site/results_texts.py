@@ -49,13 +49,30 @@ def beyond(studies, confirm, first):
     searched = [cell for cell in studies.cells if cell.study.startswith("beyond/search-")]
     slower = sum(cell.settings["learning_rate"] != 1e-3 for cell in searched)
     gained = [fmean(numbers) - before for numbers, before in zip(confirm, first, strict=True)]
+    ends = []
+    for task, wanted in (("CartPole", {}), ("Pendulum", {}), ("MountainCar", {"trained_on": "D"})):
+        episodes = [cell.episodes for cell in studies.finished("beyond/confirm-2", environment=task, **wanted)]
+        ends += [min(episodes), max(episodes)]
+    shown = [spaced(round(number, -1)) for number in ends[:4]] + [spaced(round(number, -2)) for number in ends[4:]]
+    bad = bad_on_mountain_car(searched)
     return [
         f"{len(searched)} trainings",
+        f"except in {slower} trainings",
         f"{slower} trainings start at 5e-4",
+        "ended after {} to {} episodes on CartPole, {} to {} on Pendulum, and {} to {} on MountainCar".format(*shown),
+        f"ends at {fixed(min(bad), 0)} to {fixed(max(bad), 0)} %",
         fill("is {:.1f} points better than in this table in Default", gained[0]),
         fill("and {:.1f} and {:.1f} points worse in Interpolation and Extrapolation", -gained[1], -gained[2]),
         f"reaches up to {fixed(best_on_pendulum(studies), 0)} % in Extrapolation",
     ]
+
+
+def bad_on_mountain_car(searched):
+    """Return the success of the search's bad policies on D of MountainCar, among those that the page's table has."""
+    cells = [cell for cell in searched if (cell.environment, cell.trained_on) == ("MountainCar", "D")]
+    cells = [cell for cell in cells if cell.settings["normalize_observations"]]
+    rates = [cell.success("D") for cell in cells if cell.study != "beyond/search-regularisation"]
+    return [rate for rate in rates if rate < 60]
 
 
 def best_on_pendulum(studies):
