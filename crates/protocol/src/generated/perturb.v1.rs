@@ -759,7 +759,7 @@ pub struct Act {
     /// The policy to play; if absent, the previous one continues. A new policy discards an unfinished task.
     #[prost(message, optional, tag = "1")]
     pub policy: ::core::option::Option<Policy>,
-    /// float32 \[P\]: all P weights of the policy, finite, in the order that docs/protocol.md defines. If empty, the policy
+    /// float32 \[P\]: all P weights of the policy, finite, in the order that docs/rollouts.md defines. If empty, the policy
     /// keeps its weights. A new policy needs weights. Not allowed while a task is unfinished.
     #[prost(bytes = "bytes", tag = "2")]
     pub weights: ::prost::bytes::Bytes,
@@ -882,7 +882,7 @@ pub struct RandomStream {
     pub position: u64,
 }
 /// The random streams of a test. The stream of a trial follows from this seed, the environment's index and the trial's
-/// number, see docs/protocol.md.
+/// number, see docs/rollouts.md.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, ::prost::Message)]
 pub struct TestStreams {
     /// The seed, any value.
