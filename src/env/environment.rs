@@ -183,7 +183,8 @@ pub trait Environment: Send {
     /// Reads the quantities of [`EnvironmentSpec::applied`] from the physics, and writes them to `out`, in order.
     fn applied(&self, out: &mut [f64]);
 
-    /// Returns the SHA-256 of the model's files in hexadecimal; empty for an environment without a model.
+    /// Returns the SHA-256 of the model's MJCF text in hexadecimal. A task from a folder returns the SHA-256 of the
+    /// paths and contents of all files that were read. An environment without a model returns an empty text.
     fn model_hash(&self) -> &str {
         ""
     }

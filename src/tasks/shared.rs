@@ -1,7 +1,7 @@
 //! MuJoCo simulations that environments share. Each thread has one simulation of each model, and its environments use
 //! it in turn.
 //!
-//! A model with MuJoCo's data takes 129 kB to some megabytes, but two environments differ only in some hundred bytes.
+//! A model with MuJoCo's data takes 125 kB to some megabytes, but two environments differ only in some hundred bytes.
 //! So shared simulations keep the memory of an environment small enough for the processor's caches. Environments do not
 //! affect each other: before one runs, its edit of the model and its complete state are written into the simulation.
 

@@ -25,7 +25,8 @@ pub struct EnvironmentSummary {
     /// which did not store them.
     #[serde(default)]
     pub applied: Vec<String>,
-    /// SHA-256 of the environment's model (MJCF text); empty if it has no model.
+    /// SHA-256 of the model's MJCF text, or of all files of the task folder that the server read. Empty for an
+    /// environment without a model.
     pub model_hash: String,
 }
 

@@ -120,7 +120,8 @@ pub struct Training {
     pub environment: String,
     /// The environment's revision on the server. Every change of dynamics, reward or observation raises it.
     pub environment_revision: u32,
-    /// SHA-256 of the environment's MJCF model, in hexadecimal; empty if it has none.
+    /// SHA-256 in hexadecimal of the model's MJCF text, or of all files of the task folder that the server read. Empty
+    /// for an environment without a model.
     pub model_hash: String,
     /// The version that all parameters without an entry in the settings are drawn from.
     pub version: Version,

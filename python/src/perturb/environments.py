@@ -57,7 +57,8 @@ class Environment:
         observation: the names of an observation's entries, [O].
         parameters: the parameters by name, in the order of receipts.
         success: the success rule, or None.
-        model_hash: SHA-256 of the MuJoCo model in hexadecimal digits. Empty without a model.
+        model_hash: SHA-256 in hexadecimal digits of the model's MJCF text, or of all files of the task folder that the
+            server read. Empty without a model.
         heatmap_axes: the default parameters on the x and y axis of heatmaps. Empty if there is no default.
     """
 

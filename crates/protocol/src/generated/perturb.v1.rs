@@ -59,7 +59,7 @@ pub struct Environment {
     /// The success rule of the environment.
     #[prost(message, optional, tag = "12")]
     pub success: ::core::option::Option<Success>,
-    /// SHA-256 of the model's MJCF, in hexadecimal; empty for environments without a model.
+    /// SHA-256 of the MJCF or a task folder's files, in hexadecimal; empty without a model.
     #[prost(string, tag = "13")]
     pub model_hash: ::prost::alloc::string::String,
     /// The names of the two parameters that heat maps show by default, along x and along y; empty if there is no default.
@@ -665,7 +665,7 @@ pub struct Receipt {
     /// The values read back from the physics, in the order of `Environment.applied`.
     #[prost(double, repeated, tag = "2")]
     pub applied: ::prost::alloc::vec::Vec<f64>,
-    /// SHA-256 of the model's MJCF, in hexadecimal; empty for environments without a model.
+    /// SHA-256 of the MJCF or a task folder's files, in hexadecimal; empty without a model.
     #[prost(string, tag = "3")]
     pub model_hash: ::prost::alloc::string::String,
 }

@@ -116,7 +116,8 @@ pub struct EpisodeRecord {
     pub requested: Vec<f64>,
     /// The applied values that were read back from the physics, in the order of [`RecordsMetadata::applied`].
     pub applied: Vec<f64>,
-    /// SHA-256 of the simulated model (MJCF text); empty for an environment without a model.
+    /// SHA-256 of the model's MJCF text, or of all files of the task folder that the server read. Empty for an
+    /// environment without a model.
     pub model_hash: String,
     /// The undiscounted sum of the rewards.
     pub episode_return: f64,

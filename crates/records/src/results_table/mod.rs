@@ -57,7 +57,8 @@ pub struct TableRow {
     pub environment: String,
     /// The environment's revision; `None` for a failure.
     pub revision: Option<u64>,
-    /// SHA-256 of the environment's model (MJCF text). `None` if the environment has no model, and for a failure.
+    /// SHA-256 of the model's MJCF text, or of all files of the task folder that the server read. `None` if the
+    /// environment has no model, and for a failure.
     pub model_hash: Option<String>,
     /// The algorithm's name.
     pub algorithm: String,

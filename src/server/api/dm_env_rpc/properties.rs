@@ -101,7 +101,7 @@ fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&EpisodeRe
     let mut all = vec![
         new("env_id", spec.description, text(spec.name)),
         new("revision", "raised by every change of the environment", uint32(spec.revision)),
-        new("model_hash", "SHA-256 of the model's MJCF; empty without a model", text(hash)),
+        new("model_hash", "SHA-256 of the MJCF or of a task folder's files; empty without a model", text(hash)),
         new(VERSION, "D, R or E; writing it gives all parameters its sets", text(runner.version().to_string()))
             .writable(),
         new(SEED, "fixes all randomness; writing it restarts the counts", uint64(runner.seed())).writable(),
