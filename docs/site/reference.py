@@ -292,7 +292,7 @@ def begin(programs, preset, pair, out):
 
 
 def spread(values):
-    """Return the most frequent value, and the pairs with other values."""
+    """Return a text with the most frequent default, and the other defaults with their algorithms and architectures."""
     commonest, _ = Counter(values.values()).most_common(1)[0]
     others = {}
     for pair, value in values.items():

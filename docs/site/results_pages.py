@@ -464,6 +464,7 @@ def rl2(studies):
 
 
 def locomotion(studies):
+    """Return the texts and tables of docs/findings/locomotion.md."""
     texts = []
     table = {}
     for trained in "DRE":

@@ -12,6 +12,7 @@ def spaced(number):
 
 
 def acrobot(studies):
+    """Return the texts with numbers that docs/findings/acrobot-steps.md must contain."""
     updates, deviations = [], []
     for environments, steps in ((1, 5), (1, 15), (16, 5), (16, 15)):
         cells = studies.finished("questions/acrobot", num_envs=environments, n_steps=steps, learning_rate=7e-4)

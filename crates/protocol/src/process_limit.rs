@@ -31,11 +31,12 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_limit_is_named_where_it_is_met() {
+    fn only_failures_by_the_limit_name_it() {
         let text = "Limit                     Soft Limit           Hard Limit           Units\n\
                     Max processes             4096                 63442                processes\n";
         assert_eq!(max_processes(text), Some(4096));
         assert_eq!(max_processes(&text.replace("4096 ", "unlimited ")), None);
+        // Error 11 is EAGAIN, by which the system refuses processes above the limit; error 2 is ENOENT.
         assert!(spawn_failure(&Error::from_raw_os_error(11)).contains("processes and threads"));
         assert_eq!(spawn_failure(&Error::from_raw_os_error(2)), "No such file or directory (os error 2)");
     }

@@ -191,7 +191,7 @@ fn assert_gone(reply: &Result<[u64; 2], ClientError>, ledger: &StepLog) {
 #[test]
 fn a_session_resumes_until_its_lease_ends() {
     simulations(|seed| {
-        // The server notices a cut within two seconds.
+        // The lease begins when the server notices the cut, at most two seconds after it. Both margins are longer.
         let (reply, ledger) = cut_off(seed, LEASE - Duration::from_secs(5));
         assert_eq!((reply.expect("it goes on"), ledger.done()), ([1, 2], vec![0, 1]));
         assert!(ledger.is_idle(), "its session is over");

@@ -280,7 +280,7 @@ impl Servers {
         let (done, end) = oneshot::channel::<()>();
         let runtime = &self.runtime;
         std::thread::scope(|scope| {
-            // The thread ends when `done` is dropped, by the line below or by a panic in `work`.
+            // The thread ends when `done` is dropped, by `drop(done)` below or by a panic in `work`.
             let keep_alive = move || drop(runtime.block_on(end));
             if let Err(error) = std::thread::Builder::new().name("keepalive".into()).spawn_scoped(scope, keep_alive) {
                 tracing::warn!("connections are not kept alive during an update, because no thread starts: {error}");

@@ -305,8 +305,8 @@ fn balancing_in_the_second_episode(servers: &Servers) -> Checkpoint {
     for array in &mut weights {
         array.data.fill(0.0);
         match array.name.as_str() {
-            // Rows are the gates i, f, g and o, with four cells each. Columns are the inputs x, v, θ, ω, two actions, r
-            // and d.
+            // Rows are the gates i, f, g and o, with four cells each. Columns are the inputs x, v, θ, ω, two actions, the
+            // last reward, and whether the last step ended an episode.
             "lstm.input.weight" => {
                 array.data[8 * 8 + 7] = 20.0;
                 array.data[9 * 8..][..4].copy_from_slice(&[0.0, 0.0, 5.0, 5.0]);

@@ -1,6 +1,6 @@
 //! The rate limit for the steps of a token's environments. Steps are charged after they ran. A client that has exceeded
-//! the rate waits before its next request is handled. A client that was idle may run at most one second's steps faster
-//! than the rate.
+//! the rate waits before its next request is handled. A client that was idle may run, without waiting, the steps that
+//! the rate allows in one second.
 
 use std::{
     sync::{Mutex, MutexGuard, PoisonError},

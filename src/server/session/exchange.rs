@@ -178,7 +178,7 @@ impl<H: SessionHandler> Exchange<H> {
             }
             self.price += self.handler.price(&request);
         }
-        // The request is answered. Meanwhile the next request may be read and offered to the pool.
+        // While the handler answers this request, the next one may be read, and the pool may begin it.
         let offer = if self.reads_ahead { self.handler.pipeline(&request) } else { None };
         let limits = self.request_limits();
         let Self { handler, counts, requests, ahead, .. } = self;

@@ -150,7 +150,7 @@ pub struct PpoConfig {
     /// for longer.
     pub ent_coef: f64,
     /// Weight of the KL divergence (in nats) of the new policy from the acting policy, not negative (default: `0`). A
-    /// larger value limits changes of the policy that clipping allows. Packer et al. (2018) tune it for RL².
+    /// larger value makes the policy change less, also where clipping has no effect. Packer et al. (2018) tune it for RL².
     pub kl_coef: f64,
     /// Weight of the value loss, which is the mean squared error; not negative (default: `0.5`; paper: `0.25`, because
     /// the code of Packer et al. (2018) multiplies half of the squared error by 0.5). Feed-forward policy and value

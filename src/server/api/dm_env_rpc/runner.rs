@@ -126,8 +126,8 @@ impl Runner {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins the next episode, or shows the first episode of a new world. If there are changes, a new trial begins, as
-    /// in `perturb.v1`.
+    /// Begins the next episode. The first episode of a new world began with the world, so the first call only returns its
+    /// beginning. If there are changes, a new trial begins.
     ///
     /// # Errors
     /// If the token may not draw from the new distributions, the ledger cannot be written, or the server has a defect.
