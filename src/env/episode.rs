@@ -100,10 +100,10 @@ pub(super) struct EpisodeProgress {
     pub(super) total_reward: f64,
     /// The number of the first step, from 1, after which the task's goal was met; 0 if it was not met yet.
     pub(super) reached_at: u32,
-    /// The number of consecutive steps, up to the last one, after which the task's goal was met.
+    /// How many steps in a row, up to the last one, ended with the task's goal met.
     pub(super) held_for: u32,
-    /// The maximal number of consecutive steps after which the task's goal was met. The field is skipped here, because
-    /// the first format of snapshots lacks it. Later formats store it separately, at the end.
+    /// How many steps in a row ended with the task's goal met, at most. The field is skipped here, because the first
+    /// format of snapshots lacks it. Later formats store it separately, at the end.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -121,8 +121,8 @@ pub struct Episodes {
     pub(super) observed_parameters: Option<Box<ObservedParameters>>,
 }
 
-/// Returns into how many boxes, 1 or 2, `distributions` distributions can be divided if each box has `n`. Returns
-/// `None` if neither 1 nor 2 fits. If `n` is 0, there is one box.
+/// Returns how many boxes of the parameter space, 1 or 2, a list of `distributions` distributions describes: each box has
+/// `n` of them, one for each parameter. Returns `None` if the length of the list fits neither.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }

@@ -134,8 +134,8 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// The seed, parameter distributions and current parameters of the environment in a snapshot. Audits of draws use them
-/// to find the regions of the parameter space from which the environment draws.
+/// The seed, parameter distributions and current parameters of the environment in a snapshot. The
+/// server's ledger notes from them from which regions of the parameter space the environment draws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
     /// The numbers that determine the environment's random numbers.

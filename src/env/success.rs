@@ -23,9 +23,9 @@ pub enum Achievement {
     Length,
     /// The number of the first step, from 1, after which the task's goal was met. No value if it was never met.
     FirstGoal,
-    /// The number of consecutive steps at the end of the episode after which the task's goal was met.
+    /// How many steps in a row, up to the episode's last one, ended with the task's goal met.
     LastGoals,
-    /// The maximal number of consecutive steps after which the task's goal was met.
+    /// How many steps in a row ended with the task's goal met, at most in the episode.
     LongestGoals,
     /// A quantity of the environment's own, which [`Environment::achieved`](super::Environment::achieved) returns.
     Own(QuantitySpec),

@@ -526,8 +526,9 @@ fn cut(groups: &[SlotGroupSettings], size: usize) -> Vec<Vec<SlotGroupSettings>>
     parts
 }
 
-/// Returns the number of environments in a shard. The cost of a shard's step is kept within [`SHARD_COST_US`]. Each
-/// worker gets at least one shard if its part costs at least [`MIN_WORKER_SHARE_US`].
+/// Returns the number of environments in a shard of a batch of `batch` environments. The cost of a shard's step is within
+/// [`SHARD_COST_US`], with two exceptions: a shard has at least one environment; and if an equal share of the batch costs a
+/// worker at least [`MIN_WORKER_SHARE_US`], each worker gets at least one shard.
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;

@@ -162,7 +162,7 @@ impl EditedText {
         Ok(Self { pieces })
     }
 
-    /// Returns the text with the numbers that follow from `amounts`, the amount of each edited length.
+    /// Returns the MJCF text with edited lengths. `amounts` has what [`EditedLength::amount`] returned for each of them.
     pub(super) fn write(&self, edited_lengths: &[EditedLength], amounts: &[f64]) -> String {
         let mut text = String::new();
         for piece in &self.pieces {

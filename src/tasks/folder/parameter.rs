@@ -126,9 +126,9 @@ impl EditedParameter {
             edit.targets.all.iter().map(|target| {
                 let pristine = if target.is_recompiled() { own } else { compiled };
                 match edit.change {
-                    Change::Set => edit.unscaled(target.value(model)),
+                    Change::Set => edit.value_from_number(target.value(model)),
                     Change::Scale => target.factor(pristine, model),
-                    Change::Add => edit.unscaled(target.value(model) - target.value(pristine)),
+                    Change::Add => edit.value_from_number(target.value(model) - target.value(pristine)),
                 }
             })
         });
@@ -172,9 +172,9 @@ impl ParameterEdit {
         }
     }
 
-    /// Returns the parameter's value from the `number` that an edit wrote or added, the inverse of
-    /// [`ParameterEdit::number`].
-    fn unscaled(&self, number: f64) -> f64 {
+    /// Returns the parameter's value for which an edit that sets a number writes `number`, or for which an edit that adds
+    /// a number adds `number`.
+    fn value_from_number(&self, number: f64) -> f64 {
         if self.factor.abs() == 1.0 { number * self.factor } else { number / self.factor }
     }
 
@@ -200,7 +200,7 @@ fn default(table: &TomlTable<'_>, model: &Model, edits: &[ParameterEdit]) -> Res
     }
     let own = |edit: &ParameterEdit| -> Vec<f64> {
         match edit.change {
-            Change::Set => edit.targets.all.iter().map(|target| edit.unscaled(target.value(model))).collect(),
+            Change::Set => edit.targets.all.iter().map(|target| edit.value_from_number(target.value(model))).collect(),
             Change::Scale => vec![1.0],
             Change::Add => vec![0.0],
         }
