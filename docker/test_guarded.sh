@@ -65,7 +65,7 @@ refused "the certificate of PERTURB_CERT has expired" R PERTURB_CERT=/keys/expir
 refused "asks for a client's certificate" R PERTURB_CERT= PERTURB_KEY=
 refused "no trusted authority" R PERTURB_CA=/keys/stranger_ca.pem
 refused "does not know the token" R PERTURB_TOKEN_FILE=/keys/another
-refused "asks for a token" R PERTURB_TOKEN_FILE=
+refused "requires a token" R PERTURB_TOKEN_FILE=
 refused 'a token of the role "train" may not draw from' E
 
 for server in $(compose ps --quiet server); do

@@ -4,7 +4,7 @@ The folder `perturb/_programs` gets both programs, so that perturb finds its ser
 the libraries that a Linux system may lack, such as MuJoCo; auditwheel finds them. Their licences are added to the
 package's licences. The commands in PATH are scripts that replace themselves with the programs. auditwheel puts the
 oldest glibc that the wheel runs with into the wheel's name. perturb-recurrent is not included, because libtorch and its
-dependencies have 528 MB.
+dependencies take 528 MB.
 
 Run on Debian, with auditwheel, patchelf and wheel installed: python bundle.py WHEEL PROGRAMS DIRECTORY
 """
@@ -29,7 +29,7 @@ os.execv(program, [program, *sys.argv[1:]])
 
 
 def main() -> None:
-    """Add the programs to the wheel, their libraries (by auditwheel), and the licences of the libraries."""
+    """Add the programs, their libraries (with auditwheel), and the licences of the libraries to the wheel."""
     wheel, built, out = (Path(argument).resolve() for argument in sys.argv[1:])
     with tempfile.TemporaryDirectory() as directory:
         work = Path(directory)

@@ -393,7 +393,7 @@ impl TryFrom<String> for ListenAddress {
         } else if let Ok(address) = text.strip_prefix("tcp://").unwrap_or(&text).parse() {
             return Ok(Self::Tcp(address));
         }
-        Err(format!("{text:?} is no address to listen at; expected tcp://127.0.0.1:7447 or unix:/path/to/socket"))
+        Err(format!("{text:?} is not an address to listen at; expected tcp://127.0.0.1:7447 or unix:/path/to/socket"))
     }
 }
 
@@ -441,7 +441,7 @@ impl TryFrom<String> for SocketMode {
         // The owner must be able to read and write, and nobody may execute.
         let bits = u32::from_str_radix(&text, 8).ok().filter(|bits| bits & !0o066 == 0o600);
         bits.map(Self).ok_or_else(|| {
-            format!("{text:?} is no mode of a socket; expected an octal mode such as 0600, 0660 or 0666")
+            format!("{text:?} is not a mode of a socket; expected an octal mode such as 0600, 0660 or 0666")
         })
     }
 }

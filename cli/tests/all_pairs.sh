@@ -4,11 +4,12 @@
 #     cli/tests/all_pairs.sh [EPISODES [DIRECTORY [JOBS]]]
 #
 # EPISODES is the number of episodes of each training (default 300). DIRECTORY is the folder of the runs; a run replaces
-# that of an earlier call (default target/all-pairs). JOBS is the number of simultaneous runs (default 2; a learner
-# keeps one core busy). The script prints a line for each run. The exit status is 1 if a run failed or a result is not a
-# finite number; the log of the run is in DIRECTORY/<pair and environment>/log. Variables: PROGRAMS is the folder of
-# `perturb` and `perturb-server` (default target/release), TEST_EPISODES is the number of test episodes (default 100),
-# and PAIRS and ENVIRONMENTS select what is trained.
+# the run of the same pair and environment from an earlier call (default target/all-pairs). JOBS is the number of
+# simultaneous runs (default 2; a learner keeps one core busy). The script prints a line for each run. The exit status
+# is 1 if a run failed or a number in its logs or its result is not finite. The output of each run is in
+# DIRECTORY/<environment>-<algorithm>-<architecture>/log. Variables: PROGRAMS is the folder of `perturb` and
+# `perturb-server` (default target/release), TEST_EPISODES is the number of test episodes (default 100), and PAIRS and
+# ENVIRONMENTS select what is trained.
 set -eu
 
 : "${PAIRS:=a2c:ff a2c:rc ppo:ff ppo:rc epopt-a2c:ff epopt-a2c:rc epopt-ppo:ff epopt-ppo:rc rl2-a2c:rc rl2-ppo:rc}"
@@ -23,7 +24,7 @@ figure() {
     sed -n "s/^ *\"$1\": *\([^,]*\),*$/\1/p" "$2"
 }
 
-# Tests whether all values in CSV files are finite numbers or empty. Values that were not measured are empty.
+# Tests that no value in CSV files is NaN or infinite. Empty values are allowed, because they were not measured.
 finite() {
     ! grep -qiE '(^|,)[-+]?(nan|inf)' "$@"
 }

@@ -1,12 +1,12 @@
 #!/bin/sh
-# Makes the report of a small experiment and checks it in headless Chromium: once with every kind of section, and once with
-# missing results and pictures.
+# Makes the report of a small experiment and checks it in headless Chromium: once with every kind of section, and once
+# with missing results and pictures.
 #
 #     cli/tests/report_check.sh [DIRECTORY]
 #
-# DIRECTORY gets the pages and screenshots of them; it is deleted first (default target/report-check). Variables: PROGRAMS
-# is the folder of `perturb` and `perturb-server` (default target/release), and CHROMIUM is the browser. The exit status is
-# 1 if a page is faulty.
+# DIRECTORY gets the pages and screenshots of them; it is deleted first (default target/report-check). Variables:
+# PROGRAMS is the folder of `perturb` and `perturb-server` (default target/release), and CHROMIUM is the browser. The
+# exit status is 1 if a page is faulty.
 set -eu
 
 : "${PROGRAMS:=target/release}" "${CHROMIUM:=chromium}" "${OPENBLAS_NUM_THREADS:=1}"

@@ -55,7 +55,7 @@ class Case:
     private: float
     # Target for the rate of the embedded server divided by the rate of Gymnasium.
     embedded: float | None = None
-    # Whether random actions are expected to end episodes within a round.
+    # Whether random actions are expected to end at least one episode in all rounds together.
     ends: bool = True
 
 

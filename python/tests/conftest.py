@@ -73,9 +73,9 @@ BOTH_WAYS = {"bad_input", "changes", "disturbances", "faults", "halves", "infos"
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """Run the tests of the modules in BOTH_WAYS with a server on a socket and with the embedded server."""
-    of_a_session = metafunc.module.__name__.rpartition("test_")[2] in BOTH_WAYS
-    if "server" in metafunc.fixturenames and of_a_session and not metafunc.definition.get_closest_marker("socket"):
+    """Run each test of the modules in BOTH_WAYS with both kinds of server, unless the test is marked `socket`."""
+    runs_twice = metafunc.module.__name__.rpartition("test_")[2] in BOTH_WAYS
+    if "server" in metafunc.fixturenames and runs_twice and not metafunc.definition.get_closest_marker("socket"):
         metafunc.parametrize("server", ["socket", "embedded"], indirect=True, scope="session")
 
 

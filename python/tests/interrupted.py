@@ -5,9 +5,9 @@
 The arguments are the address of a server, the id of the server's process, and the number of interrupts. Before two of
 three interrupts, the program stops the server with SIGSTOP, so that a step is waiting when the signal comes. Later it
 continues the server. After an interrupt, the session either still exists, or the next step raises OutOfOrderError and
-the program resets the environments. Any other outcome ends the program with an error, as does an interrupt that is not
-handled within SECONDS. The program prints as JSON how often the session still existed ("went on"), how often it was
-lost ("gone"), and the longest time from a signal to its KeyboardInterrupt, in seconds ("slowest").
+the program resets the environments. Any other outcome ends the program with an error. An interrupt that is not handled
+within SECONDS is also an error. The program prints as JSON how often the session still existed ("went on"), how often
+it was lost ("gone"), and the longest time from a signal to its KeyboardInterrupt, in seconds ("slowest").
 """
 
 from __future__ import annotations

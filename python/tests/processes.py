@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-# Upper bound for events that should happen within seconds, s. It is long because the machine may be busy, and shorter
-# than the default timeout of replies, 60 s.
+# Time limit, in seconds, for events that should take a few seconds. The limit is long because the machine may be busy.
+# It is shorter than the default timeout of replies, 60 s.
 SECONDS = 30.0
 
 

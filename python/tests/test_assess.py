@@ -92,7 +92,7 @@ def checksums(columns: dict[str, Any]) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("checkpoint", [CART_POLE, PENDULUM])
-def test_evaluate_and_assess_give_the_same_records(checkpoint: Path, tmp_path: Path, server: str) -> None:
+def test_python_and_the_program_give_the_same_records(checkpoint: Path, tmp_path: Path, server: str) -> None:
     evaluated(checkpoint, tmp_path / "records", server, "--episodes", "250", "--seed", "77", "--versions", "D,E,R+E")
     policy = perturb.load_policy(checkpoint)
     assessment = perturb.evaluate(
@@ -111,7 +111,7 @@ def test_evaluate_and_assess_give_the_same_records(checkpoint: Path, tmp_path: P
     ],
     ids=["rc", "rc-continuous-sees-parameters", "rl2", "random"],
 )
-def test_so_they_do_for_policies_that_remember(
+def test_python_and_the_program_agree_on_policies_that_remember(
     environment: str, settings: list[str], tmp_path: Path, server: str
 ) -> None:
     out = tmp_path / "run"
@@ -121,7 +121,7 @@ def test_so_they_do_for_policies_that_remember(
     assert saved(assessment, tmp_path / "saved") == (tmp_path / "records").read_bytes()
 
 
-def test_so_they_do_on_sets_of_ones_own_and_with_another_rule(tmp_path: Path, server: str) -> None:
+def test_python_and_the_program_agree_on_custom_sets_and_rules(tmp_path: Path, server: str) -> None:
     own = ["--parameters", "length=0.3..0.4,0.8..0.9", "mass=0.1", "--base-version", "E", "--success", "steps=90"]
     evaluated(CART_POLE, tmp_path / "records", server, "--episodes", "20", *own)
     policy = perturb.load_policy(CART_POLE)
@@ -310,7 +310,7 @@ def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
         perturb.Assessment.load(tmp_path)
     perturb.evaluate(upright, "CartPole", episodes=10, server=server).save(tmp_path)
     (tmp_path / "episodes.parquet").write_bytes(b"PAR1")
-    with pytest.raises(perturb.InvalidArgumentError, match="does not hold recorded episodes"):
+    with pytest.raises(perturb.InvalidArgumentError, match="does not contain recorded episodes"):
         perturb.Assessment.load(tmp_path)
     (tmp_path / "episodes.parquet").unlink()
     with pytest.raises(perturb.InvalidArgumentError, match="no recorded episodes in"):
@@ -397,7 +397,7 @@ def test_what_cannot_be_tested_is_refused(
         ({"name": "mine"}, "has its id for a name"),
     ],
 )
-def test_a_loaded_policy_is_what_it_is(change: dict[str, Any], words: str, server: str) -> None:
+def test_settings_that_contradict_a_loaded_policy_are_refused(change: dict[str, Any], words: str, server: str) -> None:
     settings = {"environment": "CartPole", "episodes": 1, "server": server, **change}
     with pytest.raises(perturb.PolicyError, match=words):
         perturb.evaluate(perturb.load_policy(CART_POLE), **settings)

@@ -19,7 +19,7 @@ from .test_policy import CART_POLE, POLICIES
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-# The 97.5 % quantiles of Student's t with 2, 4 and 59 degrees of freedom (from tables, to 6 digits).
+# The 97.5 % quantiles of Student's t with 2, 4 and 59 degrees of freedom (from tables, to 6 decimals).
 T_2, T_4, T_59 = 4.302653, 2.776445, 2.000995
 
 
@@ -222,7 +222,7 @@ def test_few_and_unequal_seeds_are_compared_as_such(server: str) -> None:
     it = by_pair["three", "four"]
     assert (it.paired, it.seeds, it.p is None) == (False, (3, 4), False)
     one = perturb.compare({"a": noisy(0.5, 1), "b": upright}, "CartPole", versions=("E",), episodes=30, server=server)
-    assert one.verdict.endswith("one seed of each says nothing of other seeds")
+    assert one.verdict.endswith("one seed each supports no conclusion about other seeds")
     two = perturb.compare(
         {"a": [noisy(0.5, 1), noisy(0.5, 2)], "b": [upright, upright]},
         "CartPole",

@@ -1,4 +1,4 @@
-"""Disturbances, such as delayed observations. An environment has these parameters only if its settings name one."""
+"""Disturbances, such as delayed observations. An environment has disturbances only if its settings name one."""
 
 from typing import Any
 
@@ -39,20 +39,20 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
     np.testing.assert_array_equal(np.stack(rows)[4:], own[4:])
 
 
-class RecordedSticky(StickyAction[np.ndarray, np.ndarray]):
-    """Gymnasium's wrapper with the random numbers of perturb's `action_hold` (docs/disturbances.md)."""
+class StickyActionOfPerturb(StickyAction[np.ndarray, np.ndarray]):
+    """Gymnasium's wrapper, which draws the random numbers of perturb's `action_hold` (docs/disturbances.md)."""
 
     def __init__(self, environment: gym.Env[np.ndarray, np.ndarray], probability: float, seed: int) -> None:
         super().__init__(environment, probability)
-        self._recorded = RecordedDecisions(seed)
+        self._generator = ActionHoldGenerator(seed)
 
     @property  # type: ignore[misc]
-    def np_random(self) -> "RecordedDecisions":  # type: ignore[override]
-        """The generator, which returns recorded random numbers."""
-        return self._recorded
+    def np_random(self) -> "ActionHoldGenerator":  # type: ignore[override]
+        """The generator of the wrapper's random numbers."""
+        return self._generator
 
 
-class RecordedDecisions:
+class ActionHoldGenerator:
     """A generator that returns the random numbers of `action_hold` in episode 0 of environment 0, from step 1 on."""
 
     def __init__(self, seed: int) -> None:
@@ -83,7 +83,7 @@ def test_holds_agree_with_gymnasiums_sticky_actions(server: str, identifier: str
 
     plain = gym.make(identifier, server=server, disable_env_checker=True)
     held = gym.make(identifier, server=server, disable_env_checker=True, parameters={"action_hold": 0.4})
-    np.testing.assert_array_equal(play(RecordedSticky(plain, 0.4, 7)), play(held))
+    np.testing.assert_array_equal(play(StickyActionOfPerturb(plain, 0.4, 7)), play(held))
 
 
 def test_noise_is_that_of_numpys_streams(server: str) -> None:

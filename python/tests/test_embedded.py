@@ -32,7 +32,7 @@ def same(a: Any, b: Any) -> bool:
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_batch_is_a_private_servers_to_the_last_bit(mode: AutoresetMode) -> None:
+def test_batch_equals_that_of_a_private_server_to_the_last_bit(mode: AutoresetMode) -> None:
     batches = [
         perturb.PerturbVectorEnv("CartPole", 5, version="R", server=server, autoreset_mode=mode, reward_terms=True)
         for server in (None, "embedded")
@@ -51,7 +51,7 @@ def test_batch_is_a_private_servers_to_the_last_bit(mode: AutoresetMode) -> None
         batch.close()
 
 
-def test_single_environment_is_a_private_servers_to_the_last_bit() -> None:
+def test_environment_equals_that_of_a_private_server_to_the_last_bit() -> None:
     environments = [perturb.PerturbEnv("CartPole", version="E", server=server) for server in (None, "embedded")]
     for episode in range(3):
         assert same(*(one.reset(seed=7 if episode == 0 else None) for one in environments))
@@ -65,7 +65,7 @@ def test_single_environment_is_a_private_servers_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("name", ["Hopper", "ReachingArm"])
-def test_robots_are_a_private_servers_to_the_last_bit(name: str) -> None:
+def test_robots_equal_those_of_a_private_server_to_the_last_bit(name: str) -> None:
     settings: Any = {"version": "R", "task": ROOT / "examples/tasks/reaching_arm" if name == "ReachingArm" else None}
     batches = [perturb.PerturbVectorEnv(name, 3, server=server, **settings) for server in (None, "embedded")]
     assert same(*(batch.reset(seed=2) for batch in batches))
@@ -171,7 +171,7 @@ class BrokenNative:
         """Do nothing, because there are no pings to answer."""
 
 
-def test_a_lost_session_waits_for_no_server_that_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_session_does_not_wait_for_a_server_that_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     environment = perturb.PerturbVectorEnv("CartPole", 1, server="embedded")
     environment.reset()
     session, broken = environment._client.session, BrokenNative()
@@ -183,7 +183,7 @@ def test_a_lost_session_waits_for_no_server_that_starts(monkeypatch: pytest.Monk
     environment.close()
 
 
-def test_release_without_wait_leaves_the_share() -> None:
+def test_release_without_wait_does_nothing_while_the_lock_is_held() -> None:
     server = local_server.acquire(EmbeddedServer)
     users = server.users
     with local_server._lock:

@@ -127,7 +127,7 @@ def test_names_are_spelled_as_one_likes(name: str, server: str) -> None:
     assert infos["parameters"] == expected["parameters"]
 
 
-def test_what_was_meant_is_said() -> None:
+def test_errors_say_what_was_meant() -> None:
     with pytest.raises(perturb.InvalidArgumentError, match=r"did you mean 'CartPole'\?"):
         perturb.PerturbEnv("CartPol")
     with pytest.raises(perturb.InvalidArgumentError, match="another revision than this package's perturb/CartPole-v1"):

@@ -83,10 +83,11 @@ def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
 
 @pytest.mark.parametrize("environment", ["CartPole", "Pendulum"])
 def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Path, server: str) -> None:
-    """The torch and ONNX models agree over a thousand steps.
+    """The torch and ONNX models agree with each other and with the policy over a thousand steps.
 
-    The policy samples its actions, and the exported network returns only logits or means. Therefore two actors with the
-    same seed get different observations. The same random numbers must explain the actions of both.
+    The policy samples its actions, but the exported network returns only logits or means. To compare them, two actors
+    with the same seed, and therefore the same random numbers, get different observations. The test checks that the same
+    random numbers explain the actions of both actors.
     """
     torch = pytest.importorskip("torch")
     pytest.importorskip("onnx")

@@ -44,7 +44,7 @@ while True:
 """
 
 
-def test_a_client_killed_in_mid_step_leaves_its_room(start_server: Callable[..., Any]) -> None:
+def test_a_client_killed_in_mid_step_frees_its_environments(start_server: Callable[..., Any]) -> None:
     address = start_server("--max-envs", "64").address
     client = python("-c", STEPPING.format(address=address))
     assert client.stdout is not None
@@ -66,7 +66,7 @@ def test_a_client_killed_in_mid_step_leaves_its_room(start_server: Callable[...,
 
 
 @pytest.mark.parametrize("listen", [None, "tcp://127.0.0.1:0"])
-def test_a_server_killed_under_a_client_is_told_at_once(listen: str | None, start_server: Callable[..., Any]) -> None:
+def test_a_server_killed_in_mid_step_is_reported_at_once(listen: str | None, start_server: Callable[..., Any]) -> None:
     running = start_server(listen=listen)
     envs = perturb.PerturbVectorEnv("Hopper", 256, server=running.address)
     envs.reset(seed=1)
@@ -184,7 +184,7 @@ def test_a_server_that_answers_no_pings_is_given_up(
     The test shortens the keepalive interval and limit, because their defaults add up to half a minute.
     """
     monkeypatch.setattr(session, "KEEPALIVE_INTERVAL", 1.0)
-    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # long enough for the reset, in which it applies, too
+    monkeypatch.setattr(session, "KEEPALIVE_LIMIT", 5.0)  # also applies to the reset, and is long enough for it
     running = start_server(listen="tcp://127.0.0.1:0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
@@ -193,7 +193,7 @@ def test_a_server_that_answers_no_pings_is_given_up(
         env.step(0)
 
 
-def test_what_is_no_perturb_server_is_said() -> None:
+def test_an_address_without_a_perturb_server_is_reported() -> None:
     with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="no server answers at unix:/nowhere"):
         perturb.PerturbEnv("CartPole", server="unix:/nowhere").reset()
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -256,7 +256,7 @@ def test_of_several_machines_one_that_accepts_is_taken(start_server: Callable[..
     env.close()
 
 
-TENDING = """
+OPENING_AND_CLOSING = """
 import perturb
 from perturb import session
 session.POLL_INTERVAL = 1e-6
@@ -271,8 +271,8 @@ print("went on")
 """
 
 
-def test_the_keeper_is_in_nobodys_way(server: str) -> None:
-    assert output_of("-c", TENDING.format(address=server)) == ("went on\n", "")
+def test_the_keepalive_thread_disturbs_no_session(server: str) -> None:
+    assert output_of("-c", OPENING_AND_CLOSING.format(address=server)) == ("went on\n", "")
 
 
 def test_a_wait_ends_when_another_thread_closes_the_environment(start_server: Callable[..., Any]) -> None:
@@ -441,7 +441,7 @@ local_server.LocalServer.end = say_and_end
     assert output_of("-c", ending) == ("it was closed None\n0 False\n" + "it was closed 0\n0 False\n", "")
 
 
-def test_a_private_server_that_is_killed_is_told_and_replaced() -> None:
+def test_a_killed_private_server_is_reported_and_replaced() -> None:
     env, other = perturb.PerturbEnv("CartPole"), perturb.PerturbEnv("CartPole")
     env.reset(seed=1)
     other.reset(seed=1)
@@ -525,7 +525,7 @@ def test_the_packages_own_program_comes_before_that_on_path(monkeypatch: pytest.
     assert local_server.find_program() == other
 
 
-def test_a_program_that_is_no_server_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_is_no_server_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(local_server.VARIABLE, "/bin/false")
     with within(SECONDS), pytest.raises(perturb.ServerStartError, match="ended with status 1 before it listened"):
         perturb.PerturbEnv("CartPole").reset()
@@ -621,8 +621,8 @@ def test_gymnasiums_asynchronous_batches_work(own: bool, server: str) -> None:
 
 
 @pytest.mark.parametrize("n_started", [0, 1])
-def test_a_process_without_further_threads_is_told_so(monkeypatch: pytest.MonkeyPatch, n_started: int) -> None:
-    """The system's limit of threads prevents the start of the first or second thread of a session.
+def test_a_limit_of_threads_is_reported(monkeypatch: pytest.MonkeyPatch, n_started: int) -> None:
+    """A simulated limit of threads prevents the start of the first or second thread of a session.
 
     The first thread reads the output of the private server, and the second answers keepalive pings.
     """

@@ -13,9 +13,10 @@ from .conftest import ROOT, identifier
 
 CASES = [json.loads(line) for line in (ROOT / "tests/server/data/classic_control.jsonl").read_text().splitlines()]
 
-# Tolerances of one step, relative, or absolute below 1. Each side rounds to float32, by half an ulp. Pendulum's torque,
-# at most 2 N m, is also rounded, by 2^-24 of itself. With E's light rods, the error of the speed is this error times
-# 3 / (m l²) · 0.05 s ≤ 1.2.
+# Tolerances of one step: absolute for numbers below 1, relative for larger ones. The server and Gymnasium each round to
+# float32, with an error of up to half an ulp. Pendulum's torque, at most 2 N m, is also rounded, with an error of up to
+# 2^-24 of the torque. The error of the speed is the torque's error times 3 / (m l²) · 0.05 s. With E's light rods this
+# factor is at most 1.2.
 SINGLE_STEP = {"CartPole": 1.2e-7, "MountainCar": 1.2e-7, "Acrobot": 1.2e-7, "Pendulum": 4e-7}
 
 

@@ -135,7 +135,7 @@ def played(server: str) -> list[bytes]:
         pytest.param(MUTUAL_TLS | TOKENS, ALL, id="all"),
     ],
 )
-def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
+def test_a_client_with_credentials_plays_as_at_an_open_socket(
     asks: Files, has: Files, start: Callable[[Files], str], have: Callable[[Files], None], server: str
 ) -> None:
     address = start(asks)
@@ -175,14 +175,14 @@ def test_who_has_what_is_asked_for_plays_as_at_an_open_socket(
         ),
         pytest.param(
             IDENTITY,
-            "the server at {address} refuses this process: this server asks for a token, and none came; ask "
-            "who runs it for one, and name the file that has it in PERTURB_TOKEN_FILE",
+            "the server at {address} refuses this process: this server requires a token, and none was sent; "
+            "ask its operator for one, and name the file that has it in PERTURB_TOKEN_FILE",
             id="no-token",
         ),
         pytest.param(
             ALL | {"PERTURB_TOKEN_FILE": "another"},
-            "the server at {address} refuses this process: this server does not know the token that came; ask "
-            "who runs it for one that is good",
+            "the server at {address} refuses this process: this server does not know the token that was sent; "
+            "ask its operator for a valid one",
             id="wrong-token",
         ),
         pytest.param(
@@ -214,7 +214,7 @@ def test_missing_credentials_are_named_and_can_be_added(
         ("elsewhere", "its certificate is not for this name"),
     ],
 )
-def test_a_server_that_is_not_to_be_trusted_is_not(
+def test_a_server_with_an_invalid_certificate_is_refused(
     certificate: str, says: str, start: Callable[[Files], str], have: Callable[[Files], None]
 ) -> None:
     address = start({"--tls-cert": f"{certificate}.pem", "--tls-key": f"{certificate}.key"})
@@ -245,7 +245,7 @@ def test_a_token_does_not_go_unencrypted_to_another_machine(have: Callable[[File
         perturb.PerturbEnv("CartPole", server="192.0.2.1:7447").reset()
 
 
-def test_a_unix_socket_needs_none_of_it(have: Callable[[Files], None], server: str) -> None:
+def test_a_unix_socket_needs_no_credentials(have: Callable[[Files], None], server: str) -> None:
     have({"PERTURB_CA": "missing", "PERTURB_CERT": "missing", "PERTURB_TOKEN_FILE": "missing"})
     for address in (server, None):
         env = perturb.PerturbEnv("CartPole", server=address)
@@ -277,13 +277,13 @@ def test_a_reset_that_a_role_does_not_allow_changes_nothing(
     twin.close()
 
 
-def step_until_told(envs: perturb.PerturbVectorEnv) -> None:
+def step_until_error(envs: perturb.PerturbVectorEnv) -> None:
     while True:
         envs.step(np.zeros(envs.num_envs, dtype=np.int64))
         time.sleep(0.05)
 
 
-def test_a_token_that_is_taken_out_ends_its_sessions(
+def test_sessions_end_when_their_token_is_revoked(
     start_server: Callable[..., Server], have: Callable[[Files], None], tmp_path: Path
 ) -> None:
     tokens = tmp_path / "tokens.toml"
@@ -297,7 +297,7 @@ def test_a_token_that_is_taken_out_ends_its_sessions(
         within(SECONDS),
         pytest.raises(perturb.ServerConnectionError, match='refuses this process: the token "ann" was revoked'),
     ):
-        step_until_told(envs)
+        step_until_error(envs)
     with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to begin anew.* was revoked"):
         envs.step(np.zeros(2, dtype=np.int64))
     with pytest.raises(perturb.ServerConnectionError, match="does not know the token"):

@@ -24,7 +24,7 @@ def equal(a: object, b: object) -> bool:
 
 
 def with_hashes_as_rows(infos: dict[str, Any]) -> dict[str, Any]:
-    """Convert `model_hash` in infos of Gymnasium's vector environment, tuples, to rows of uint8 as in a batch."""
+    """Convert each `model_hash` in infos of Gymnasium's vector environment from a tuple to a row of uint8."""
     rows = dict(infos)
     for key, value in infos.items():
         if isinstance(value, dict):
@@ -72,7 +72,11 @@ def run(envs: gymnasium.vector.VectorEnv[Any, Any, Any], steps: int) -> list[Any
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("name", ["CartPole", "Hopper"])
 def test_batch_equals_gymnasiums_vector_of_singles(name: str, mode: AutoresetMode, receipts: bool, server: str) -> None:
-    """The observations, rewards, flags and infos are equal, with their structure, types and masks."""
+    """The observations, rewards, flags and infos are equal, with their structure, types and masks.
+
+    Two types differ: rewards are float32 in the batch and float64 in Gymnasium's environment, and `model_hash` has rows
+    of uint8 instead of tuples.
+    """
     n, steps = 5, 150
     settings: dict[str, Any] = {"version": "E", "server": server, "receipts": receipts, "reward_terms": True}
     settings["episodes_per_trial"] = 2
@@ -118,7 +122,7 @@ def test_final_observations_and_infos_follow_gymnasium(server: str) -> None:
     envs.close()
 
 
-def test_success_is_told_at_the_end_and_only_there(server: str) -> None:
+def test_success_is_reported_only_at_the_end(server: str) -> None:
     env = gymnasium.make("perturb/CartPole-v1", server=server)
     observation, info = env.reset(seed=1)
     assert "is_success" not in info

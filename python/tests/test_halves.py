@@ -66,7 +66,7 @@ def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., A
     assert min(seconds(0.1 + 4 * computing)) < computing / 2
 
 
-def test_what_is_wrong_with_a_step_is_told_in_its_turn(server: str) -> None:
+def test_the_error_of_a_step_comes_from_its_own_recv(server: str) -> None:
     envs, twin = (perturb.PerturbVectorEnv("Pendulum", 2, server=server) for _ in range(2))
     envs.reset(seed=1)
     twin.reset(seed=1)
@@ -105,7 +105,7 @@ def test_halves_out_of_order_are_refused_and_change_nothing(server: str) -> None
     envs.step(ACTIONS[0])
 
 
-def test_replies_that_fill_the_line_do_not_block_requests(start_server: Callable[..., Any]) -> None:
+def test_replies_that_fill_the_buffers_do_not_block_requests(start_server: Callable[..., Any]) -> None:
     """64 requests of 320 kB and 64 replies of 1.8 MB are more than the buffers of a connection hold."""
     n = 80_000
     running = start_server("--max-envs", str(n))
@@ -124,7 +124,7 @@ def step_in_halves(envs: perturb.PerturbVectorEnv) -> None:
     envs.recv()
 
 
-def test_a_server_that_dies_is_told_to_who_waits_for_its_steps(start_server: Callable[..., Any]) -> None:
+def test_send_and_recv_report_a_server_that_died(start_server: Callable[..., Any]) -> None:
     running = start_server()
     envs = make(running.address)
     envs.send(ACTIONS[0])
@@ -146,7 +146,7 @@ def test_batches_in_threads_do_not_wait_for_each_other(server: str) -> None:
         envs = make(server)
         results.append([envs.step(actions)[0].tobytes() for actions in ACTIONS])
 
-    threads = [threading.Thread(target=run) for _ in range(24)]  # more sessions than the maximum number of runtimes
+    threads = [threading.Thread(target=run) for _ in range(24)]  # more sessions than Tokio runtimes
     for thread in threads:
         thread.start()
     for thread in threads:

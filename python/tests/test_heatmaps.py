@@ -36,7 +36,7 @@ def test_a_test_over_two_parameters_is_that_of_the_program(checkpoint: Path, tmp
     assert saved(assessment, tmp_path / "saved") == Path(made + ".parquet").read_bytes()
 
 
-def test_reports_have_it_beside_those_of_others(tmp_path: Path, server: str) -> None:
+def test_reports_show_the_heatmap_of_an_assessment(tmp_path: Path, server: str) -> None:
     over = perturb.sets.heatmap("CartPole", "length", "force", points=4, fixed={"mass": 0.2})
     policies = {"D": upright, "E": upright}
     assessment = perturb.evaluate(policies, "CartPole", versions=["D", over], episodes=32, server=server, name="pushes")

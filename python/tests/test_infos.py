@@ -80,7 +80,7 @@ def test_infos_have_numbers_alone(server: str) -> None:
 
 
 def test_achieved_is_there_at_each_end(server: str) -> None:
-    """`achieved` is NaN without a value, because Monitor of stable-baselines3 needs a key always or never."""
+    """`achieved` without a value is NaN, not absent: stable-baselines3's Monitor needs its keys at each end."""
     env = gymnasium.make(identifier("MountainCar"), server=server)
     env.reset(seed=1)
     info: dict[str, Any] = {}
@@ -96,7 +96,7 @@ def test_achieved_is_there_at_each_end(server: str) -> None:
     assert infos["_achieved"].all()
 
 
-def test_later_infos_count_where_both_tell() -> None:
+def test_merge_prefers_later_infos() -> None:
     mask, other = np.array([True, False, True]), np.array([False, True, True])
     infos: dict[str, Any] = {
         "a": np.array([1, 0, 3]),

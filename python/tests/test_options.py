@@ -207,7 +207,7 @@ def test_snapshots_of_a_batch_move_between_slots(server: str) -> None:
 
 
 def long_snapshots() -> dict[str, list[tuple[float, float]]]:
-    """Give CartPole twelve distributions of 64 intervals each, so that a snapshot takes some 12 kB."""
+    """Return distributions of twelve parameters of CartPole, 64 intervals each. A snapshot then takes some 12 kB."""
     ranges = {"force": (5, 10), "length": (0.3, 0.7), "mass": (0.1, 0.2), "push_interval": (10, 90)}
     ranges |= {f"changed_{name}": ranges[name] for name in ("force", "length", "mass")}
     rates = ("action_hold", "change_probability", "push", "sensor_dropout", "sensor_noise")
@@ -245,7 +245,7 @@ def test_long_snapshots_are_followed_by_the_same_bytes(
 
 
 def test_a_restore_whose_later_part_is_refused_is_remembered(server: str) -> None:
-    """A long restore is sent in several requests. If a later one is refused, the earlier ones were done."""
+    """A long restore is sent in several requests. If a later request is refused, the earlier ones have been applied."""
     envs = make_vec("Hopper", num_envs=8192, server=server)
     envs.reset(seed=3)
     saved = envs.snapshot()

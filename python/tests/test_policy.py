@@ -1,4 +1,4 @@
-"""Loaded policies choose the same actions as in the learner. The checkpoints are from a shipped experiment."""
+"""Policies are loaded from checkpoints and choose actions. The checkpoints are from a shipped experiment."""
 
 from __future__ import annotations
 

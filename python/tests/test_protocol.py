@@ -97,7 +97,7 @@ def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> 
 
 
 @pytest.mark.parametrize(("outcome", "achieved"), [({"achieved": 0.5}, 0.5), ({}, NAN)])
-def test_what_an_episode_achieved_is_told_or_nan(outcome: dict[str, float], achieved: float, fake: FakeServer) -> None:
+def test_the_achieved_value_is_reported_or_nan(outcome: dict[str, float], achieved: float, fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened()), Answer(stepped=ended(**outcome))] * 2
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
@@ -237,7 +237,7 @@ def test_a_refusal_costs_nothing(code: int, error: type[Exception], fake: FakeSe
     assert fake.sessions == 1
 
 
-def test_a_stream_that_ends_is_told(fake: FakeServer) -> None:
+def test_a_stream_that_ends_is_reported(fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened())]
     env = perturb.PerturbEnv("CartPole", server=fake.address, timeout=5)
     env.reset()
@@ -248,7 +248,7 @@ def test_a_stream_that_ends_is_told(fake: FakeServer) -> None:
 
 def test_another_service_is_no_perturb_server() -> None:
     other = FakeServer("SomethingElse")
-    with pytest.raises(perturb.ProtocolError, match="no perturb-server"):
+    with pytest.raises(perturb.ProtocolError, match="not a perturb-server"):
         perturb.PerturbEnv("CartPole", server=other.address).reset()
     other.end()
 

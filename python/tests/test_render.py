@@ -109,7 +109,7 @@ def test_the_size_is_the_one_that_was_asked_for(server: str) -> None:
         assert env.render().shape == (height, width, 3)
 
 
-def test_as_many_frames_are_shown_as_are_simulated(server: str) -> None:
+def test_the_frame_rate_is_that_of_the_simulation(server: str) -> None:
     """The number of frames per second follows from the lengths of steps in docs/environments.md."""
     frames = {"CartPole": 50, "MountainCar": 1, "Acrobot": 5, "Pendulum": 20, "HalfCheetah": 60.6, "Hopper": 60.6}
     for name, expected in frames.items():
@@ -183,7 +183,7 @@ def test_drawing_out_of_order_is_refused(server: str) -> None:
 def test_without_opengl_only_classic_tasks_are_drawn(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # no driver, for the server
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_FILENAMES", "/nowhere.json")  # the server finds no OpenGL driver
     address = start_server().address
     robot = make("Hopper", address)
     robot.reset(seed=1)
@@ -200,7 +200,7 @@ def test_human_rendering_is_gymnasiums(server: str) -> None:
         perturb.PerturbVectorEnv("CartPole", 2, server=server, render_mode="human")
 
 
-def test_a_server_killed_while_it_draws_is_told_at_once(start_server: Callable[..., Any]) -> None:
+def test_a_killed_server_is_reported_by_render(start_server: Callable[..., Any]) -> None:
     running = start_server()
     env = make("CartPole", running.address)
     env.reset(seed=1)

@@ -81,7 +81,7 @@ def test_what_cannot_be_reported_is_refused(assessment: perturb.Assessment, tmp_
         assessment.save("/proc/nowhere")
 
 
-def test_the_same_policy_is_replayed_and_another_is_told(tmp_path: Path, server: str) -> None:
+def test_audit_accepts_the_same_policy_and_finds_another(tmp_path: Path, server: str) -> None:
     sets: list[Any] = ["D", perturb.sets.grid("corners", {"length": [0.3, 0.9]}, base="R")]
     assessment = perturb.evaluate(
         upright, "CartPole", versions=sets, episodes=30, seed=9, success="steps=90", server=server, name="pushes"

@@ -30,7 +30,7 @@ def test_the_published_table_has_every_study_with_its_plan() -> None:
 def test_another_file_is_no_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pandas")
     (tmp_path / "other.parquet").write_text("text")
-    with pytest.raises(perturb.InvalidArgumentError, match="is no results table: it is no Parquet file"):
+    with pytest.raises(perturb.InvalidArgumentError, match="is not a results table: it is not a Parquet file"):
         perturb.read_results(tmp_path / "other.parquet")
     with pytest.raises(perturb.InvalidArgumentError, match="there is no results table"):
         perturb.read_results(tmp_path / "none.parquet")

@@ -87,7 +87,7 @@ def test_a_step_has_what_stable_baselines3_expects(server: str) -> None:
     plain.close()
 
 
-def test_rewards_terms_are_told_on_request(server: str) -> None:
+def test_reward_terms_come_on_request(server: str) -> None:
     envs = make_vec_env("Pendulum", 2, server=server, reward_terms=True, seed=1)
     envs.reset()
     _, rewards, _, infos = envs.step(np.zeros((2, 1), np.float32))

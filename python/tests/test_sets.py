@@ -1,4 +1,4 @@
-"""Sets of parameters, and environments that have contexts of a list."""
+"""Sets of parameters, and environments whose contexts come from a list."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_sets_are_those_of_experiment_files(tmp_path: Path) -> None:
     assert perturb.sets.grid("one", {"length": 0.5}).contexts == ({"length": 0.5},)
 
 
-def test_a_policy_is_tested_on_them_as_the_program_tests_it(tmp_path: Path, server: str) -> None:
+def test_a_policy_is_tested_on_a_grid_as_by_the_program(tmp_path: Path, server: str) -> None:
     own = ["--parameters", "length=0.8..1.2/3", "mass=1"]
     evaluated(PENDULUM, tmp_path / "records", server, "--episodes", "20", *own)
     points = perturb.sets.grid("parameters", {"length": "0.8..1.2/3", "mass": 1})

@@ -41,7 +41,7 @@ def steps(env: Any, count: int = 5) -> list[bytes]:
     return told + [env.step(action)[0].tobytes() for _ in range(count)]
 
 
-def test_a_folder_is_made_by_id_name_or_nothing_but_itself(tmp_path: Path) -> None:
+def test_an_environment_is_made_by_id_by_name_or_from_the_folder_alone(tmp_path: Path) -> None:
     walker = perturb.tasks.from_gymnasium("Walker2d-v5", tmp_path / "walker2d")
     env = gymnasium.make("perturb/Walker2dV5-v0", task=walker, version="R")
     assert env.observation_space.shape == (17,)
@@ -122,7 +122,7 @@ def test_running_environments_keep_the_files_they_opened(arm: Path) -> None:
     [
         ({"server": "unix:/nowhere"}, "leave server= out, or start that server with `perturb-server --task DIR`"),
         ({"task": "/nowhere/at/all"}, "/nowhere/at/all does not exist; docs/tasks.md describes folders of tasks"),
-        ({"task": ARM / "task.toml"}, "task.toml is no folder"),
+        ({"task": ARM / "task.toml"}, "task.toml is not a folder"),
         ({"task": ROOT}, "has no file task.toml"),
         ({"task": 7}, "task=7; expected the path of a folder"),
         ({"environment": "Hopper"}, "environment='Hopper' is not the task in .*, which is 'ReachingArm'"),

@@ -47,7 +47,7 @@ def test_an_unknown_id_is_refused_with_those_that_there_are(tmp_path: Path) -> N
         from_gymnasium("Walker2d-v4", tmp_path)
 
 
-def test_a_missing_model_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_model_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(perturb.tasks, "_assets", lambda: tmp_path)
     with pytest.raises(FileNotFoundError, match="install gymnasium"):
         from_gymnasium("Ant-v5", tmp_path / "ant")

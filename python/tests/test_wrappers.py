@@ -1,4 +1,4 @@
-"""Gymnasium's vector wrappers give equal values around a batch of perturb and around Gymnasium's own batch."""
+"""A batch in one of Gymnasium's vector wrappers returns the values of an unwrapped batch, changed as expected."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
-//! The state of a saved assessment: recorded tests of a policy, which the Python package wrote. The state is read again
-//! when its files change.
+//! The state of a saved assessment: recorded tests of one or several policies, which the Python package wrote. The
+//! state is read again when its files change.
 
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
@@ -23,7 +23,7 @@ impl LiveAssessment {
     /// Makes an empty state of the assessment in the folder `path`. [`refresh`](Self::refresh) fills it. Files outside
     /// of `root` are not read.
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
-        let status = Err("it was not read yet".into());
+        let status = Err("it has not been read yet".into());
         Self { root: root.to_owned(), path: path.to_owned(), stamps: Vec::new(), status }
     }
 

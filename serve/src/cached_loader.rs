@@ -94,7 +94,7 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
             if let Some(last) = last.as_ref().filter(|last| last.at.elapsed() < pause_after(last.duration)) {
                 return last.value.clone();
             }
-            // The semaphore is never closed.
+            // This cannot fail, because the semaphore is never closed.
             let permit = permits.acquire_owned().await;
             let start = Instant::now();
             let mut load = tokio::task::spawn_blocking(load);
@@ -109,7 +109,7 @@ impl<T: Clone + Send + 'static> CachedLoader<T> {
                 }
             };
             let value = loaded.map_err(|error| {
-                tracing::error!("reading the files of a page failed: {error}");
+                tracing::error!("loading a page failed: {error}");
                 CachedLoadError::Panicked
             });
             *last = Some(LoadedValue { value: value.clone(), at: Instant::now(), duration: start.elapsed() });

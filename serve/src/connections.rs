@@ -25,7 +25,8 @@ use tower_service::Service;
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct ConnectionLimits {
     /// Maximum number of open connections. A browser opens about six. When the maximum is reached, a new connection
-    /// replaces the oldest one that has no request in progress. If all connections have one, the new connection waits.
+    /// replaces the oldest connection that has no request in progress. If every connection has a request in progress,
+    /// the new connection waits.
     max_connections: usize,
     /// Maximum time for a client to send the head of a request. It counts from the start of the connection, or from the
     /// end of the last response.
@@ -82,7 +83,8 @@ impl OpenConnections {
     }
 }
 
-/// Counts a request as in progress, until its response was sent or dropped.
+/// A guard for a request in progress, which ends when its response was sent or dropped. Dropping the guard decreases
+/// [`OpenConnection::requests`].
 struct RequestGuard(Arc<OpenConnection>);
 
 impl Drop for RequestGuard {
@@ -179,7 +181,7 @@ mod tests {
     /// Maximum time for which a test waits for something. It is long, because the machine may be busy.
     const DEADLINE: Duration = Duration::from_secs(30);
 
-    /// Serves a short page at `/`, one that takes longer than the head's timeout at `/slow`, and a large one at
+    /// Serves a short page at `/`, a page that takes longer than `head_timeout` at `/slow`, and a large page at
     /// `/large`.
     async fn start() -> SocketAddr {
         let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();

@@ -9,14 +9,14 @@ use crate::tail::{MAX_READ_BYTES, Tail, TailUpdate};
 const MAX_GROUPS: usize = 512;
 /// Maximum number of points of a curve.
 const MAX_POINTS: usize = 160;
-/// Minimum number of episodes that a point averages, unless the log has fewer.
+/// Minimum number of episodes that a point averages. The last point may average fewer.
 const MIN_EPISODES_PER_POINT: usize = 10;
 /// Minimum time over which a speed is measured, in seconds.
 const MIN_SPEED_SECONDS: f64 = 1.0;
 /// Maximum number of different speeds in a curve.
 const MAX_SPEEDS: f64 = 40.0;
-/// Two consecutive parts of the curve count as written to the log at once if the times of their last episodes differ by
-/// less than this. The unit is the time over which the speed is measured.
+/// Consecutive parts of the curve count as written to the log at once if the times of their last episodes differ by
+/// less than this. The value is a fraction of the time over which the speed is measured.
 const SAME_BLOCK_SHARE: f64 = 0.02;
 
 /// The episodes of a growing log, summed up in groups.
@@ -28,9 +28,9 @@ pub(crate) struct EpisodeLog {
     groups: Vec<EpisodeGroup>,
     /// Number of episodes in each group. The last group may have fewer.
     group_size: usize,
-    /// Number of lines that were read.
+    /// Number of lines that were read, without empty lines.
     lines: usize,
-    /// The error of the first line that could not be parsed.
+    /// The error of the first line that could not be parsed, or of a line that is too long to be read.
     line_fault: Option<String>,
     /// The reason why the file could not be read at the last attempt.
     read_error: Option<String>,
@@ -122,8 +122,8 @@ impl EpisodeLog {
         self.groups.iter().map(|group| group.episodes).sum()
     }
 
-    /// Returns the mean length of episodes in steps and the speed in steps per second, over the last tenth of the
-    /// training time. Returns `None` if they are not known yet.
+    /// Returns the mean length of episodes in steps and the speed in steps per second. Both are measured over the last
+    /// tenth of the training time, but at least over [`MIN_SPEED_SECONDS`]. Returns `None` if they are not known yet.
     pub(crate) fn recent(&self) -> Option<(f64, f64)> {
         let end = self.groups.last()?.end;
         let is_old = |group: &EpisodeGroup| end - group.end >= MIN_SPEED_SECONDS.max(end / 10.0);

@@ -27,7 +27,7 @@ pub enum ServeError {
 fn explained(error: &std::io::Error) -> String {
     match error.kind() {
         ErrorKind::AddrInUse => {
-            "another program listens there already; end it, or give another port, e.g. --address 127.0.0.1:0 for a free one"
+            "another program already listens there; stop it, or give another port, for example --address 127.0.0.1:0"
                 .into()
         }
         ErrorKind::AddrNotAvailable => "it is not an address of this machine".into(),
@@ -43,6 +43,6 @@ pub(crate) enum ViewError {
     RunNotFound,
     /// The served folder cannot be listed. The text has the reason.
     Unlisted(String),
-    /// The run's files could not be read.
+    /// Loading the page has panicked or takes too long.
     Load(CachedLoadError),
 }

@@ -40,9 +40,9 @@ impl Eta {
         self.0.clear();
     }
 
-    /// Returns the remaining time in seconds, at the speed since the first sample. `shares` has the finished share of
-    /// each cell, and `weights` the durations of the cells relative to each other. Returns `None` before there is
-    /// enough progress.
+    /// Returns the remaining time in seconds, at the speed since the oldest stored sample. `shares` has the finished
+    /// share of each cell, and `weights` the durations of the cells relative to each other. Returns `None` before there
+    /// is enough progress.
     pub(crate) fn remaining_seconds(&self, now: Instant, shares: &[f32], weights: &[f64]) -> Option<f64> {
         let (start, then) = self.0.front()?;
         let time = now.duration_since(*start);

@@ -69,7 +69,8 @@ struct CellProgress {
 struct ReportFiles {
     /// Time at which the files were listed.
     at: Option<Instant>,
-    /// Number of settled cells (finished or failed), and the time of their last change in seconds since 1970.
+    /// Number of settled cells (finished or failed), and the time of the last change of the plan, a result or a failure
+    /// in seconds since 1970.
     settled: (usize, i64),
     /// A hash of the files' names and stamps.
     fingerprint: u64,
@@ -99,7 +100,7 @@ impl LiveExperiment {
             read: None,
             read_duration: Duration::ZERO,
             stamps: [None; 2],
-            status: Err("it was not read yet".into()),
+            status: Err("it has not been read yet".into()),
             last_running: None,
             trainings: HashMap::new(),
             progress: HashMap::new(),
@@ -111,10 +112,10 @@ impl LiveExperiment {
         }
     }
 
-    /// Reads the status again if its files have changed, or if enough time has passed.
+    /// Reads the status again if the experiment is running, if its files have changed, or if enough time has passed.
     pub(crate) fn refresh(&mut self) {
-        // A new cell changes the stamp of `cells/`. A change inside a cell's folder does not, so the status is also
-        // read again after some time.
+        // A new cell changes the stamp of `cells/`, but a change inside a cell's folder does not. Therefore the status
+        // is also read again while the experiment is running, and otherwise after a pause.
         let stamps = ["cells", "plan.toml"].map(|name| Stamp::read(&self.path.join(name)));
         let is_idle = self.state() != "in work";
         let reread_pause = LOCK_INTERVAL.max(self.read_duration * REREAD_FACTOR);
@@ -239,7 +240,8 @@ impl LiveExperiment {
         outside.map_or_else(|| Ok(self.path.clone()), |name| Err(format!("{name} is {LEADS_OUT}")))
     }
 
-    /// Returns the training of a running cell. Returns `None` if the cell is not among the first [`MAX_CURVES`].
+    /// Returns the training of a running cell. Returns `None` if the cell is not among the first [`MAX_CURVES`] running
+    /// cells.
     pub(crate) fn training(&self, id: &str) -> Option<&LiveTraining> {
         self.trainings.get(id)
     }
@@ -292,13 +294,13 @@ fn test_cost(cell: &Cell) -> f64 {
     TEST_SHARE * tested_episodes(cell)
 }
 
-/// Returns the duration of each cell relative to the others. It is the measured duration of cells of the same kind, or
-/// an estimate from the number of the cell's episodes.
+/// Returns the duration of each cell relative to the others. The duration is the measured mean of finished cells with
+/// the same environment and method. If there are none, it is estimated from the number of the cell's episodes.
 fn weights(status: &ExperimentStatus) -> Vec<f64> {
     let taken = status.durations();
     let cells = &status.plan.cells;
     let episodes = |cell: &Cell| generated_episodes(&cell.config, cell.config.common.episodes) + test_cost(cell);
-    // The measured seconds per episode of each cell, without cells whose kind has no measured duration yet.
+    // The seconds per episode of each cell whose duration is measured.
     let measured: Vec<f64> =
         cells.iter().filter_map(|cell| taken.seconds(cell).map(|seconds| seconds / episodes(cell))).collect();
     let mean = if measured.is_empty() { 1.0 } else { perturb_records::statistics::mean(measured.iter().copied()) };
@@ -306,8 +308,8 @@ fn weights(status: &ExperimentStatus) -> Vec<f64> {
 }
 
 impl ReportFiles {
-    /// Finds the files that a report reads: the plan, the tables beside it, the heatmaps, and the files of finished and
-    /// failed cells.
+    /// Finds the files that a report reads: the plan, the tables beside it, the heatmaps, and the files of cells with a
+    /// result or failure.
     fn list(status: &ExperimentStatus, settled: (usize, i64), root: &Path) -> Self {
         let mut hasher = DefaultHasher::new();
         let mut outside = None;

@@ -30,7 +30,7 @@ use pages::{MessagePage, error_page};
 /// Time between two comment lines that are sent on an event stream without events. A failed send shows that the client
 /// is no longer connected.
 const KEEP_ALIVE_INTERVAL: Duration = Duration::from_secs(15);
-/// Content security policy of pages. It permits only scripts, styles and pictures from this server.
+/// Content security policy of pages. It permits scripts, styles, pictures, films and frames only from this server.
 const PAGE_POLICY: &str =
     "default-src 'self'; object-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 /// Content security policy of reports and files. It permits inline styles and embedded pictures, but no scripts.
@@ -79,13 +79,14 @@ pub(crate) fn router(state: Arc<AppState>) -> Router {
         .with_state(state)
 }
 
-/// Refuses methods other than GET and HEAD, unknown host names, and requests that a page of another site caused. Makes
-/// the links of message pages relative, and adds the security headers to each response.
+/// Refuses methods other than GET and HEAD, and requests by which a page of another site embeds something. If the
+/// server listens on the loopback address, also refuses unknown host names. Makes the links of message pages relative,
+/// and adds the security headers to each response.
 async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next) -> Response {
     let relative_root = RelativeRoot::from_path(request.uri().path());
     let mut response = if !matches!(*request.method(), Method::GET | Method::HEAD) {
         let mut response =
-            pages::message_page(StatusCode::METHOD_NOT_ALLOWED, "This server changes nothing; use GET or HEAD.");
+            pages::message_page(StatusCode::METHOD_NOT_ALLOWED, "This server is read-only; use GET or HEAD.");
         response.headers_mut().insert(header::ALLOW, HeaderValue::from_static("GET, HEAD"));
         response
     } else if state.is_loopback && !is_known_host(request.headers(), request.uri(), &state.hosts) {
@@ -115,8 +116,9 @@ async fn guard(State(state): State<Arc<AppState>>, request: Request, next: Next)
     response
 }
 
-/// Tells whether a page of another site embeds a picture, frame or script from this server. Such a page could not read
-/// the response, but could make the server read files all the time. Links from other sites are permitted.
+/// Tells whether a page of another site embeds or fetches something from this server, e.g. a picture, frame or script.
+/// Such a page could not read the response, but could make the server read files all the time. Links from other sites
+/// are permitted.
 fn is_embedded_by_another_site(headers: &HeaderMap) -> bool {
     let header_text = |name: &str| headers.get(name).and_then(|value| value.to_str().ok());
     let is_link =
@@ -211,7 +213,7 @@ fn events(state: &AppState, topic: Topic, ClientAddress(peer): ClientAddress) ->
 
 async fn report(State(state): State<Arc<AppState>>, uri: Uri) -> Response {
     let Some(relative) = relative_path(&uri, "/report/") else { return error_page(&ViewError::RunNotFound) };
-    // The report is built from the same files as the experiment's page.
+    // The page of the run has the folder and the fingerprint of the report's files.
     let source = match state.publisher.view(&Topic::Run(relative)).await {
         Ok(view) => view.update.report_source.clone(),
         Err(error) => return error_page(&error),

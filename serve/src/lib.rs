@@ -1,8 +1,8 @@
 //! `perturb serve`: a read-only web page that shows trainings and experiments while they run.
 //!
-//! - [`Server`] listens. `connections` limits the number of connections, and `stream_places` that of event streams.
-//!   `http` routes requests and refuses requests from other sites, and `links` makes links relative.
-//! - `paths` and `files` send files of the served folder.
+//! - [`Server`] listens. `connections` limits the number of connections, and `stream_places` the number of event
+//!   streams. `http` routes requests and refuses embedding by other sites, and `links` makes links relative.
+//! - `paths` checks the paths in addresses, and `files` sends files of the served folder.
 //! - `publisher` reads the files of open pages and sends changes as server-sent events. `cached_loader` limits how
 //!   often files are read, and `runs` keeps the state of each run between two readings.
 //! - `training`, `experiment`, `assessment`, `index` and `pictures` read runs. `tail` and `curve` follow a growing log,
@@ -55,7 +55,7 @@ pub struct ServeOptions {
     /// Host names that requests may state in addition to localhost, e.g. the name of a reverse proxy. They matter only
     /// if the server listens on the loopback address.
     pub hosts: Vec<String>,
-    /// A perturb-server (a server that simulates environments) whose status the page shows.
+    /// A perturb-server (a server that simulates environments) whose status the list of all runs shows.
     pub server: Option<perturb_protocol::Address>,
 }
 

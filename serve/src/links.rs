@@ -18,7 +18,8 @@ impl RelativeRoot {
         Self::from_path("/")
     }
 
-    /// Returns the relative path to the root from the page of a run. The page's address does not end with a slash.
+    /// Returns the relative path to the root from the page of a run. The page's address ends with a slash only if the
+    /// run is the served folder itself.
     pub(crate) fn from_run(relative: &RelativePath) -> Self {
         Self("../".repeat(relative.path().iter().count().max(1)))
     }

@@ -39,8 +39,8 @@ impl Pictures {
     }
 }
 
-/// Finds the pictures in one folder, in the order of their names. At most `max_shown` files are examined, and the
-/// others are only counted. A picture that exists in two formats is listed once.
+/// Finds the pictures in one folder, in the order of their names. Lists at most `max_shown` pictures, and only counts
+/// the others. A picture that exists in two formats is listed once.
 pub(crate) fn scan_folder(relative: &RelativePath, path: &Path, max_shown: usize) -> Pictures {
     let mut found = Pictures::default();
     let listed = files::list(path).unwrap_or_default(); // sorted

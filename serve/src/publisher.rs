@@ -1,6 +1,6 @@
 //! Loads pages, and publishes their changes to subscribers.
 //!
-//! A subscriber is a browser that has a page open. One task reads the files of all open pages again and again. A
+//! A subscriber is a browser that has a page open. [`Publisher::run`] loads all open pages again and again. A
 //! subscriber always gets the latest event, so a slow subscriber misses events in between.
 
 use std::collections::HashMap;
@@ -44,7 +44,7 @@ pub(crate) enum Topic {
     Curves(Vec<RelativePath>),
 }
 
-/// The data of an event as it is sent to browsers. It is empty before the first load of a page.
+/// The data of an event as it is sent to browsers. It is empty before the first event of a page.
 pub(crate) type EventData = Arc<str>;
 
 /// A loaded page.
@@ -179,7 +179,7 @@ impl Publisher {
         })
     }
 
-    /// Adds a subscriber of `topic`. The receiver's first value is empty if the page was not loaded yet.
+    /// Adds a subscriber of `topic`. The receiver's first value is the last event, or empty if there was none yet.
     pub(crate) fn subscribe(&self, topic: Topic) -> watch::Receiver<EventData> {
         let mut topics = self.topics();
         let receiver = topics.entry(topic).or_insert_with(|| watch::channel(EventData::from("")).0).subscribe();

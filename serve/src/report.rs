@@ -108,7 +108,8 @@ impl ReportCache {
         // The build is a separate task, so that it continues even if the request is given up.
         let task = tokio::spawn(async move {
             let _permit = permit;
-            // Only the task with this lock may build. Meanwhile another task may have built the report.
+            // Only the task with this lock may build. While this task waited for the lock, another task may have built
+            // the report.
             let mut next_build = this.next_build.lock().await;
             if this.overdue().contains(&folder) {
                 return Err(STILL_BUILDING.into());

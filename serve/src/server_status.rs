@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use perturb_protocol::{Address, Connection, Timeouts};
 
-/// Time between two requests to the server.
+/// Minimum time between two polls of the server.
 pub(crate) const POLL_INTERVAL: Duration = Duration::from_secs(2);
 /// Number of latest response times whose median and maximum are shown.
 const MAX_RESPONSE_TIMES: usize = 30;
@@ -64,8 +64,8 @@ impl ServerMonitor {
 
     async fn request(&self) -> Result<ServerStatus, String> {
         let message = |error: perturb_protocol::ClientError| error.to_string();
-        let patience = Timeouts { reply: RESPONSE_TIMEOUT, ..Timeouts::default() };
-        let connection = Connection::open_with(&self.address, patience).await.map_err(message)?;
+        let timeouts = Timeouts { reply: RESPONSE_TIMEOUT, ..Timeouts::default() };
+        let connection = Connection::open_with(&self.address, timeouts).await.map_err(message)?;
         let start = Instant::now();
         let catalogue = connection.catalogue().await.map_err(message)?;
         let mut times = self.response_times.lock().unwrap_or_else(PoisonError::into_inner);

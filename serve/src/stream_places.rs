@@ -13,7 +13,7 @@ const MAX_STREAMS_PER_PEER: usize = 32;
 #[derive(Clone, Debug, Default)]
 pub(crate) struct StreamPlaces(Arc<Mutex<HashMap<IpAddr, usize>>>);
 
-/// A permit for one event stream. Dropping it releases the permit.
+/// A permit for one event stream. Dropping it makes room for another stream.
 #[derive(Debug)]
 pub(crate) struct StreamPlace {
     places: StreamPlaces,

@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 
 use perturb_files::{Stamp, open_plain};
 
-/// Maximum number of bytes that one call reads. The next call continues after them. A longer line is not read.
+/// Maximum number of bytes that one call of [`Tail::read_new`] reads. The next call continues after them. A longer line
+/// is not read.
 pub(crate) const MAX_READ_BYTES: u64 = 64 << 20;
 /// Number of bytes before the read position that are compared with the file again. A difference shows that the file was
 /// truncated and has grown again.
@@ -20,7 +21,7 @@ pub(crate) struct Tail {
     offset: u64,
     /// The bytes before `offset`, at most [`CONTEXT_BYTES`].
     context: Vec<u8>,
-    /// Inode of the file if its next line is too long. Nothing more is read from it.
+    /// Inode of the file if its next line is too long. Nothing more is read from the file unless it is truncated.
     oversized_inode: Option<u64>,
 }
 

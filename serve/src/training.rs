@@ -26,7 +26,8 @@ pub(crate) struct LiveTraining {
     root: PathBuf,
     path: PathBuf,
     stamps: [Option<Stamp>; STATUS_FILES.len()],
-    /// Time of the last check of the lock.
+    /// Time of the last check of the lock; `None` before the first check, or if a symbolic link leads out of the served
+    /// folder.
     checked: Option<Instant>,
     status: Result<TrainingStatus, String>,
     /// The log of episodes; `None` until the learning curve is requested.
@@ -39,7 +40,7 @@ impl LiveTraining {
     pub(crate) fn new(root: &Path, path: &Path) -> Self {
         let root = root.to_owned();
         let path = path.to_owned();
-        let status = Err("it was not read yet".into());
+        let status = Err("it has not been read yet".into());
         Self { root, path, stamps: Default::default(), checked: None, status, episodes: None }
     }
 

@@ -163,7 +163,8 @@ pub struct Transition {
     /// [`Achievement::LastGoals`](super::Achievement::LastGoals) and
     /// [`Achievement::LongestGoals`](super::Achievement::LongestGoals) are computed from it.
     pub goal: bool,
-    /// Whether the physics diverged, i.e. the state is not finite. Then `terminated` is true, too.
+    /// Whether the physics diverged, i.e. the state is not finite or cannot be sent as float32. Then `terminated` is
+    /// true, too.
     pub diverged: bool,
 }
 
@@ -235,7 +236,8 @@ pub trait Environment: Send {
     /// [`EnvironmentSpec::reward_terms`].
     fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Transition;
 
-    /// Appends the complete dynamic state to `out`. Together with the parameters it determines all later steps.
+    /// Appends the complete dynamic state to `out`. The state, the parameters, the address (see
+    /// [`Environment::set_address`]) and the actions together determine all later steps of the episode.
     fn save(&self, out: &mut Vec<f64>);
 
     /// Returns an upper bound of the number of additional entries that [`Environment::save`] would append if the

@@ -11,7 +11,8 @@ use crate::scene::Scene;
 pub struct EpisodeSettings {
     /// The seed.
     pub seed: u64,
-    /// The environment's index. Seed, index and episode number together determine all random numbers of an episode.
+    /// The environment's index. Seed, index and trial number determine the random numbers for the parameters of a
+    /// trial. Seed, index and episode number determine all other random numbers of an episode.
     pub environment_index: u32,
     /// The distributions of one or two boxes of the parameter space, one box after the other. A box has a distribution
     /// for each parameter, in the order of [`EnvironmentSpec::parameters`], within the parameters' bounds. Each trial
@@ -73,7 +74,7 @@ pub struct FinishedEpisode {
     pub code_achieved: Option<f64>,
     /// Whether the episode is a success by the environment's success rule.
     pub success: bool,
-    /// Whether the physics diverged, i.e. the state is not finite.
+    /// Whether the physics diverged, i.e. the state is not finite or cannot be sent as float32.
     pub diverged: bool,
     /// The receipt with the episode's parameters, if requested.
     pub receipt: Option<EpisodeReceipt>,
@@ -102,8 +103,8 @@ pub(super) struct EpisodeProgress {
     pub(super) reached_at: u32,
     /// How many steps in a row, up to the last one, ended with the task's goal met.
     pub(super) held_for: u32,
-    /// How many steps in a row ended with the task's goal met, at most. The field is skipped here, because the first
-    /// format of snapshots lacks it. Later formats store it separately, at the end.
+    /// The largest number of successive steps of the episode that ended with the task's goal met. Serde skips this
+    /// field, because the first format of snapshots lacks it. Later formats store it separately, after the other data.
     #[serde(skip)]
     pub(super) held_longest: u32,
     pub(super) ended: bool,
@@ -121,8 +122,8 @@ pub struct Episodes {
     pub(super) observed_parameters: Option<Box<ObservedParameters>>,
 }
 
-/// Returns how many boxes of the parameter space, 1 or 2, a list of `distributions` distributions describes: each box has
-/// `n` of them, one for each parameter. Returns `None` if the length of the list fits neither.
+/// Returns the number of boxes of the parameter space, 1 or 2, that a list of `distributions` distributions describes.
+/// Each box has `n` distributions, one for each parameter. Returns `None` if the list's length fits neither number.
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
     (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
 }
@@ -176,9 +177,12 @@ impl Episodes {
         self.start(state);
     }
 
-    /// Begins a new trial. `distributions`, if given, replaces the distributions. `seed`, if given, replaces the seed
-    /// and restarts trial and episode numbers at 0. If `state` is given, the first episode begins in exactly this
-    /// state.
+    /// Begins a new trial. `distributions`, if given, replaces the distributions by as many new ones. `seed`, if given,
+    /// replaces the seed and restarts trial and episode numbers at 0. If `state` is given, the first episode begins in
+    /// exactly this state.
+    ///
+    /// # Panics
+    /// If `distributions` has another length than the present distributions.
     pub fn begin_trial(&mut self, seed: Option<u64>, distributions: Option<&[Distribution]>, state: Option<&[f64]>) {
         if let Some(distributions) = distributions {
             self.settings.distributions.clone_from_slice(distributions);

@@ -57,8 +57,8 @@ pub enum Error {
     },
     /// A disturbance was requested in a session that was opened without disturbances.
     #[error(
-        "{environment} was opened without disturbances, so that {name:?} cannot change; open it again with a \
-         disturbance, such as {name:?} at its default"
+        "{environment} was opened without disturbances, so {name:?} cannot change; open it again with a \
+         disturbance, such as {name:?} at its default value"
     )]
     NotDisturbed {
         /// The environment's name.
@@ -67,7 +67,10 @@ pub enum Error {
         name: String,
     },
     /// A parameter takes whole numbers, but an interval of its distribution contains none.
-    #[error("parameter {parameter:?} of {environment} takes whole numbers, and {got} has none; give such as 2 or 0..4")]
+    #[error(
+        "parameter {parameter:?} of {environment} takes whole numbers, and {got} has none; give whole numbers, such as \
+         2 or 0..4"
+    )]
     NotWhole {
         /// The environment's name.
         environment: &'static str,
@@ -83,9 +86,7 @@ pub enum Error {
         reason: String,
     },
     /// Two environments of a server would have the same name.
-    #[error(
-        "the name {name:?} is that of an environment that this server has already, {taken:?}; give it another name"
-    )]
+    #[error("this server already has an environment {taken:?}; give {name:?} another name")]
     NameTaken {
         /// The name of the new environment.
         name: &'static str,

@@ -7,7 +7,7 @@ use std::{array, sync::LazyLock};
 const N_LAYERS: usize = 256;
 /// Half the width of the ziggurat's lowest rectangle. The tail of the distribution begins here.
 const EDGE: f64 = 3.654_152_885_361_009;
-/// The area of each layer, the same for all. The area of the lowest layer includes the tail.
+/// The area of the right half (x ≥ 0) of a layer, the same for all layers. In the lowest layer it includes the tail.
 const AREA: f64 = 0.004_928_673_233_974_655;
 /// The number of equal parts into which half the width of a layer is divided: a random 52-bit number selects one.
 const N_FRACTIONS: f64 = (1u64 << 52) as f64;
@@ -21,7 +21,8 @@ struct ZigguratLayer {
     inside: u64,
     /// The width of one of the [`N_FRACTIONS`] parts.
     width: f64,
-    /// The value of the curve exp(-x²/2) at the end of the layer.
+    /// The value of the curve exp(-x²/2) at half the layer's width, where the lower edge of the layer meets the curve.
+    /// Layer 0 has 1 instead, the height of the curve's top, which is the upper edge of layer 1.
     curve: f64,
 }
 
@@ -94,8 +95,8 @@ impl PhiloxStream {
         }
     }
 
-    /// Draws `N` ≤ 4 standard normal numbers, the same as `N` calls of [`normal`](Self::normal), but faster: usually all
-    /// come from one block of random bits, and are computed without a branch.
+    /// Draws `N` ≤ 4 standard normal numbers, the same as `N` calls of [`normal`](Self::normal), but faster. Usually
+    /// all come from one block of random bits, and are computed without a branch.
     #[inline]
     pub fn normals<const N: usize>(&mut self) -> [f64; N] {
         if let Some(block) = self.peek_block() {

@@ -73,8 +73,8 @@ impl ParameterSpec {
     }
 
     /// Returns the distribution of a version. For R+E, this is the union of the intervals of R and E, although a trial
-    /// draws all parameters from R or all from E. Intervals of E that have length 0 are left out: in a task folder, E
-    /// may extend to only one side of R.
+    /// draws all parameters from R or all from E. Intervals of length 0 are left out: in a task folder, E may extend to
+    /// only one side of R. If no interval is left, the distribution is the default value.
     pub fn distribution(&self, version: Version) -> Distribution {
         let [below, above] = self.extreme;
         let intervals: &[Interval] = match version {

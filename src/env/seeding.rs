@@ -51,7 +51,8 @@ pub enum DrawPurpose {
     Change = 7,
 }
 
-/// The numbers that, together with the parameters' distributions, determine all random numbers of an episode.
+/// The numbers that determine all random numbers of an episode except its parameters. The parameters depend on the
+/// trial's number instead of the episode's number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Draw {
     /// The seed.

@@ -18,7 +18,7 @@ const FIRST: u32 = 1;
 /// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
 ///
 /// - the distributions of R and of E for 32 parameters and 76 disturbances, of 64 intervals each: 216 KiB;
-/// - a state and an observation of 4096 entries: some 50 KiB;
+/// - a state, and an observation of 4096 entries: some 50 KiB;
 /// - delayed actions and observations: 80 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 384 << 10;
 
@@ -48,7 +48,7 @@ struct Saved {
 }
 
 impl Episodes {
-    /// Returns a snapshot of the environment: its physics, parameters, counters and random streams.
+    /// Returns a snapshot of the environment: its physics, parameters, counters and settings, including the seed.
     pub fn snapshot(&self) -> Vec<u8> {
         let spec = self.spec();
         let mut state = Vec::new();
@@ -134,11 +134,11 @@ pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
     distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
-/// The seed, parameter distributions and current parameters of the environment in a snapshot. The
-/// server's ledger notes from them from which regions of the parameter space the environment draws.
+/// The seed, parameter distributions and current parameters of the environment in a snapshot. The server's ledger uses
+/// them to record the regions of the parameter space from which the environment draws.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SavedDraw {
-    /// The numbers that determine the environment's random numbers.
+    /// The seed, environment index and episode index of the environment's current episode.
     pub draw: Draw,
     /// The distributions of the environment's parameters, as in [`EpisodeSettings::distributions`].
     pub distributions: Vec<Distribution>,
@@ -147,7 +147,7 @@ pub struct SavedDraw {
     pub values: Vec<f64>,
 }
 
-/// Reads the random draws in a snapshot without restoring it.
+/// Reads the seed, distributions and parameters in a snapshot without restoring it.
 ///
 /// # Errors
 /// [`Error::Snapshot`] if the snapshot is damaged, or is not of the environment `spec`.
@@ -221,7 +221,7 @@ impl Saved {
     fn distributions(spec: &'static EnvironmentSpec, saved: &Saved) -> Result<Vec<Distribution>, Error> {
         let bad = |error: Error| Error::Snapshot { reason: error.to_string() };
         let refuse_value = |name, value| {
-            Err(Error::Snapshot { reason: format!("its parameter {name:?} is {value}, which is no whole number") })
+            Err(Error::Snapshot { reason: format!("its parameter {name:?} is {value}, which is not a whole number") })
         };
         let parameters = spec.parameters.iter().zip(&saved.values).cycle();
         let each = parameters.zip(&saved.distributions);

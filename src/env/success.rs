@@ -25,7 +25,7 @@ pub enum Achievement {
     FirstGoal,
     /// How many steps in a row, up to the episode's last one, ended with the task's goal met.
     LastGoals,
-    /// How many steps in a row ended with the task's goal met, at most in the episode.
+    /// The largest number of successive steps of the episode that ended with the task's goal met.
     LongestGoals,
     /// A quantity of the environment's own, which [`Environment::achieved`](super::Environment::achieved) returns.
     Own(QuantitySpec),

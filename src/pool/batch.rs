@@ -1,4 +1,5 @@
-//! The environments of a session. Each request is run on the pool's workers, and its outputs are gathered into a reply.
+//! The environments of a session. A request runs on the pool's workers, or on the session's thread if it is cheap. Its
+//! outputs are gathered into a reply.
 
 use super::{
     Error,
@@ -32,8 +33,8 @@ use tokio::{sync::oneshot, time::Instant};
 /// The minimum and maximum cost of a step of one shard, µs. The minimum makes the overhead of the queue small in
 /// comparison. The maximum lets other sessions use the worker soon.
 const SHARD_COST_US: RangeInclusive<f64> = 20.0..=200.0;
-/// The number of shards for each worker, so that all workers finish at about the same time. There are fewer shards if
-/// so many would be cheaper than the minimum of [`SHARD_COST_US`].
+/// The intended number of shards for each worker, so that all workers finish at about the same time. The limits of
+/// [`SHARD_COST_US`] take precedence.
 const SHARDS_PER_WORKER: f64 = 32.0;
 /// The minimum cost of each worker's part of a batch's step, µs. A cheaper batch is not split among all workers.
 const MIN_WORKER_SHARE_US: f64 = 10.0;
@@ -49,7 +50,9 @@ pub struct ResetEntry {
     pub slot: usize,
     /// A new seed; `None` keeps the seed.
     pub seed: Option<u64>,
-    /// New distributions, one for each parameter; `None` keeps the distributions.
+    /// New distributions, one for each parameter in each box, in the layout of
+    /// [`EpisodeSettings::distributions`](crate::env::EpisodeSettings::distributions), and as many as before. `None`
+    /// keeps the distributions.
     pub distributions: Option<Arc<[Distribution]>>,
     /// An exact initial state, `[S]`, finite; `None` draws the initial state.
     pub state: Option<Vec<f64>>,
@@ -65,7 +68,7 @@ pub struct Batch {
     workers: Arc<StepScheduler>,
     n_workers: usize,
     buffer: BytesMut,
-    /// The number of requests that were passed to the workers so far.
+    /// The number of requests of the present `job` that were passed to the workers so far.
     n_requests: u64,
     /// Whether a request was passed to the workers and the session has not yet seen its end.
     is_running: bool,
@@ -166,13 +169,13 @@ impl Batch {
         let ended = self.workers.wait(&self.job, number).await;
         self.is_running = false;
         // If a pipelined step followed this step, the worker has already gathered the result of this step.
-        let (pipelined_since, end) = {
+        let (gathered, end) = {
             let mut pipelined = lock(&self.job.pipelined);
             (pipelined.take_result(), pipelined.ended_at())
         };
-        self.pipelined_since = pipelined_since.as_ref().map(|(_, begun)| *begun);
+        self.pipelined_since = gathered.as_ref().map(|(_, begun)| *begun);
         ended?;
-        match pipelined_since {
+        match gathered {
             Some((stepped, end)) => {
                 self.observe(start, end);
                 Ok(stepped)
@@ -205,8 +208,8 @@ impl Batch {
     /// replace an unfinished one, that the mode is [`Autoreset::SameStep`], and that policy and weights fit the batch.
     ///
     /// # Errors
-    /// [`Error::Policy`] if numbers are not finite, [`Error::Defect`] if a worker panicked. After an error, the next
-    /// call needs a new policy.
+    /// [`Error::Policy`] if an input or an output of the policy is not finite, [`Error::Defect`] if a worker panicked.
+    /// After an error, the next call needs a new policy.
     pub async fn act(&mut self, request: RolloutRequest) -> Result<Rollout, Error> {
         self.ready().await?;
         let task = Box::new(RolloutTask::new(request, self.runner.take()));
@@ -319,7 +322,7 @@ impl Batch {
         Ok(self.observations(&slots))
     }
 
-    /// Returns the current distributions of a slot's environment, one for each parameter.
+    /// Returns the current distributions of a slot's environment, one for each parameter in each box.
     pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
         lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
     }
@@ -376,8 +379,8 @@ impl Batch {
         Ok(lock(&self.job.shards[slot / self.shard_size]).scene(slot))
     }
 
-    /// Returns an upper bound of the length of each environment's snapshot, bytes. The bound holds until a reset
-    /// replaces a distribution by a distribution with more intervals.
+    /// Returns an upper bound of the length of each environment's snapshot, bytes. The bound holds until a reset or a
+    /// restore replaces a distribution by a distribution with more intervals.
     pub fn max_snapshot_bytes(&self) -> usize {
         let own = lock(&self.job.shards[0]).max_snapshot_bytes();
         let distributions = |group: &SlotGroupSettings| distributions_bytes(&group.episodes.distributions);
@@ -468,7 +471,9 @@ impl Drop for Batch {
             if let Some(hook) = self.drop_hook.take() {
                 hook(draws(&self.job));
             }
-            return; // frees the environments here, so the pool has room immediately
+            // If no worker uses the environments, they are freed here, so the pool has room immediately. Otherwise the
+            // last worker that uses them frees them.
+            return;
         }
         // The last owner of the job frees the environments. The reaper becomes this owner, so that neither this thread
         // nor a worker is blocked.
@@ -508,13 +513,13 @@ fn job(
 fn cut(groups: &[SlotGroupSettings], size: usize) -> Vec<Vec<SlotGroupSettings>> {
     let (mut parts, mut part, mut free_slots) = (Vec::new(), Vec::new(), size);
     for group in groups {
-        let mut deferred = group.clone();
-        while deferred.size > 0 {
-            let taken = deferred.size.min(free_slots);
-            part.push(SlotGroupSettings { size: taken, ..deferred.clone() });
-            deferred.size -= taken;
+        let mut remaining = group.clone();
+        while remaining.size > 0 {
+            let taken = remaining.size.min(free_slots);
+            part.push(SlotGroupSettings { size: taken, ..remaining.clone() });
+            remaining.size -= taken;
             // The index may overflow if no slot of the group remains, but then the index is never used.
-            deferred.episodes.environment_index = deferred.episodes.environment_index.wrapping_add(taken as u32);
+            remaining.episodes.environment_index = remaining.episodes.environment_index.wrapping_add(taken as u32);
             free_slots -= taken;
             if free_slots == 0 {
                 parts.push(std::mem::take(&mut part));
@@ -526,9 +531,9 @@ fn cut(groups: &[SlotGroupSettings], size: usize) -> Vec<Vec<SlotGroupSettings>>
     parts
 }
 
-/// Returns the number of environments in a shard of a batch of `batch` environments. The cost of a shard's step is within
-/// [`SHARD_COST_US`], with two exceptions: a shard has at least one environment; and if an equal share of the batch costs a
-/// worker at least [`MIN_WORKER_SHARE_US`], each worker gets at least one shard.
+/// Returns the number of environments in a shard, at least 1, of a batch of `batch` environments. The cost of a shard's
+/// step is about within [`SHARD_COST_US`], with two exceptions. A single environment may cost more. If a worker's
+/// equal share of the batch costs at least [`MIN_WORKER_SHARE_US`], a shard has at most this share, and may cost less.
 fn shard_size(spec: &EnvironmentSpec, batch: usize, workers: usize) -> usize {
     let by_workers = batch.div_ceil(workers);
     let share = spec.step_cost * by_workers as f64;

@@ -17,9 +17,9 @@ use tokio::sync::Notify;
 /// The maximum cost of a batch's step that runs on the session's thread, µs. Passing such a cheap step to a worker
 /// would take longer than running it.
 pub(super) const INLINE_MAX_US: f64 = 20.0;
-/// The limit that replaces [`INLINE_MAX_US`], in µs, if the server's previous step was of the same session, so that no
-/// other session is waiting. Up to this cost, passing the batch to workers takes longer than running it in parallel
-/// saves.
+/// The limit that replaces [`INLINE_MAX_US`], in µs, if the server's previous step was of the same session. Other
+/// sessions are then probably idle. Up to this cost, passing the batch to workers takes longer than running it in
+/// parallel saves.
 pub(super) const INLINE_MAX_US_UNCONTENDED: f64 = 80.0;
 /// The maximum cost of a batch's step, µs, at which resets of the batch also run on the session's thread. A reset costs
 /// as much as a few steps.

@@ -2,8 +2,9 @@
 //!
 //! A batch is cut into shards, each with its own environments and output buffers. A request puts the batch into the
 //! workers' queue. A worker takes one shard of the batch at the front of the queue. If shards remain, it puts the batch
-//! at the back, so that batches of different sessions take turns, whatever their sizes. The last shard to finish wakes
-//! the session, which gathers the outputs into one reply. Results do not depend on which worker ran which shard.
+//! at the back, so that batches of different sessions take turns, whatever their sizes. The worker that finishes the
+//! last shard wakes the session, which gathers the outputs into one reply. Results do not depend on which worker ran
+//! which shard. A cheap batch is stepped on the session's own thread, because passing it to workers would take longer.
 //!
 //! A pipelined step is a step that is requested while another step of the batch is running. It starts as soon as the
 //! running step ends: the worker of the last shard gathers the outputs and puts the batch back into the queue, before
@@ -48,7 +49,8 @@ pub enum Error {
     Environment(#[from] env::Error),
     /// The pool has no room for the environments. Nothing was changed.
     #[error(
-        "{requested} environments were asked for, but {used} of this server's {limit} are in use; open fewer, or later"
+        "{requested} environments were asked for, but {used} of this server's {limit} are in use; open fewer, or try \
+         again later"
     )]
     Full {
         /// The number of environments that were requested.
@@ -67,7 +69,7 @@ pub enum Error {
         slots: String,
     },
     /// An input or an output of a policy is not finite. The policy's rollout has ended.
-    #[error("the policy's play has ended: {0}; hand over another policy")]
+    #[error("the server stopped playing the policy: {0}; send another policy")]
     Policy(#[from] perturb_policy::Error),
     /// A worker panicked, which is a defect of the server. The batch is lost.
     #[error(

@@ -1,4 +1,4 @@
-//! The thread that frees the environments of closed sessions.
+//! The thread that frees the environments of closed sessions, and environments that a session has released.
 
 use super::sync::lock;
 use crate::priority::lower;
@@ -17,9 +17,8 @@ use std::{
 /// The niceness of the thread. The thread's priority is low, because no request waits for it.
 const REAPER_NICENESS: i32 = 3;
 
-/// A function that frees a closed session's batch if no worker uses the batch any more. It returns whether the batch is
-/// freed. The reaper's thread calls it, because freeing thousands of environments would block the transport thread for
-/// too long.
+/// A function that frees environments unless a worker still uses them, and returns whether they are freed. The reaper's
+/// thread calls it, because freeing thousands of environments would block the transport thread for too long.
 pub(super) type DeferredDrop = Box<dyn FnMut() -> bool + Send>;
 /// The interval at which freeing a batch that was still in use is retried.
 const REAP_INTERVAL: Duration = Duration::from_millis(1);
@@ -27,7 +26,7 @@ const REAP_INTERVAL: Duration = Duration::from_millis(1);
 /// The handle to the reaper's thread.
 pub(super) struct Reaper {
     drops: Mutex<Option<mpsc::Sender<DeferredDrop>>>,
-    /// The number of queued batches that have not been freed yet.
+    /// The number of [`DeferredDrop`]s whose environments have not been freed yet.
     pending: Arc<AtomicUsize>,
 }
 
@@ -49,7 +48,7 @@ impl Reaper {
         Ok((Self { drops: Mutex::new(Some(drops)), pending }, thread))
     }
 
-    /// Queues a batch to be freed by the thread.
+    /// Queues environments to be freed by the thread.
     pub(super) fn drop_later(&self, deferred: DeferredDrop) {
         if let Some(drops) = &*lock(&self.drops) {
             self.pending.fetch_add(1, Ordering::AcqRel);
@@ -57,7 +56,7 @@ impl Reaper {
         }
     }
 
-    /// Waits until the thread has freed all queued batches.
+    /// Waits until the thread has freed all queued environments.
     pub(super) async fn idle(&self) {
         while self.pending.load(Ordering::Acquire) > 0 {
             tokio::time::sleep(REAP_INTERVAL).await;
@@ -70,7 +69,7 @@ impl Reaper {
     }
 }
 
-/// Frees queued batches as soon as they are not in use, until the sender is dropped.
+/// Frees queued environments as soon as they are not in use, until the sender is dropped.
 fn reap(received: &mpsc::Receiver<DeferredDrop>, pending: &AtomicUsize) {
     let mut left: Vec<DeferredDrop> = Vec::new();
     loop {

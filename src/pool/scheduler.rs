@@ -104,7 +104,7 @@ impl Pool {
         &self.shared.waits
     }
 
-    /// Waits until the environments of all dropped batches have been freed.
+    /// Waits until the reaper's thread has freed all environments that were passed to it.
     pub async fn freed(&self) {
         self.shared.reaper.idle().await;
     }
@@ -135,7 +135,7 @@ pub(super) struct StepScheduler {
     /// The number of jobs in the queue. It can be read without locking the queue.
     waiting: AtomicUsize,
     ready: Condvar,
-    /// Whether the pool is closing. If so, rollouts end after their current step.
+    /// Whether the pool is closing. If so, rollouts end after their current step, and pipelined steps are dropped.
     closing: AtomicBool,
     /// The job that was stepped last. The pointer is only compared, never dereferenced.
     last_stepped: AtomicPtr<Job>,
@@ -205,7 +205,7 @@ impl StepScheduler {
     /// Waits until the workers have finished the first `number` requests of a job.
     pub(super) async fn wait(&self, job: &Arc<Job>, number: u64) -> Result<(), Error> {
         let has_ended = || job.ended.load(Ordering::Acquire) >= number;
-        // For a cheap job, the session polls before it sleeps, because waking the session costs more than many steps.
+        // For a cheap job, the session polls before it sleeps, because waking it often takes longer than the step.
         for _ in 0..job.polls {
             if has_ended() {
                 break;
@@ -219,7 +219,8 @@ impl StepScheduler {
         job.result()
     }
 
-    /// Puts a job with `parts` parts at the back of the queue, and wakes at most `helpers` workers.
+    /// Puts a job with `parts` parts at the back of the queue, and wakes sleeping workers. `helpers` is the number of
+    /// wanted workers. If at least two workers are wanted and at least two sleep, wakes all that sleep.
     fn push(&self, job: &Arc<Job>, parts: usize, helpers: usize) {
         let now = Instant::now();
         let mut queue = lock(&self.queue);

@@ -98,8 +98,8 @@ impl Shard {
         Self { groups, command: Command::Open, ..Self::with_environments(settings, Vec::new(), (first_slot, size)) }
     }
 
-    /// Makes a shard of `size` slots from `first_slot` on, with existing environments. Until the next step, only the
-    /// observations of its outputs are valid.
+    /// Makes a shard of `size` slots from `first_slot` on, with existing environments. Its observations are valid at
+    /// once, its other outputs only after the next step.
     pub(super) fn with_environments(
         settings: &BatchSettings,
         slots: Vec<Episodes>,
@@ -304,8 +304,9 @@ impl Shard {
             self.backups.push((*slot, self.slots[*slot].snapshot()));
             let restored = self.slots[*slot].restore(snapshot);
             let ended = self.autoreset == Autoreset::SameStep && self.slots[*slot].ended();
-            let refused =
-                || env::Error::Snapshot { reason: "its episode has ended, which same-step mode resets".into() };
+            let refused = || env::Error::Snapshot {
+                reason: "its episode has ended, which a session in same-step mode cannot hold".into(),
+            };
             if let Err(error) = restored.and_then(|()| if ended { Err(refused()) } else { Ok(()) }) {
                 self.failure = Some(error);
                 return;

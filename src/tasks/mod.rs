@@ -1,8 +1,9 @@
 //! The built-in environments, each in a module of its own, and their catalogue. The module `folder` loads environments
 //! that users define by an MJCF model and a TOML file.
 //!
-//! Each environment's file has the same parts in the same order: specification with parameters, derived quantities,
-//! reset, dynamics, reward and termination. `drawing.rs` has the content of its pictures.
+//! Each analytic environment (`acrobot`, `cart_pole`, `mountain_car`, `pendulum`) has its specification, constants,
+//! state and dynamics in `mod.rs`, and the content of its pictures in `drawing.rs`. `hopper` and `half_cheetah` have
+//! only a specification and the description of a robot. The module `locomotion` simulates these two robots.
 
 mod analytic;
 #[cfg(feature = "mujoco")]

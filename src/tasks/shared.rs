@@ -1,5 +1,5 @@
-//! MuJoCo simulations that environments share. Each thread has one simulation of each model, and its environments use
-//! it in turn.
+//! MuJoCo simulations that environments share. Each thread has one simulation of each model. All environments of this
+//! model that the thread runs use the simulation in turn.
 //!
 //! A model with MuJoCo's data takes 125 kB to some megabytes, but two environments differ only in some hundred bytes.
 //! So shared simulations keep the memory of an environment small enough for the processor's caches. Environments do not

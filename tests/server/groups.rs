@@ -215,7 +215,7 @@ async fn released_environments_make_room_at_once() {
 }
 
 #[rstest]
-#[case(&[], "release.mask is all of the 3 environments; expected at least one environment that goes and one that stays")]
+#[case(&[], "release.mask is all of the 3 environments; expected at least one environment to free and one to keep")]
 #[case(&[1, 1, 1], "release.mask is all of the 3 environments")]
 #[case(&[0, 0, 0], "release.mask is without a selected environment")]
 #[case(&[1, 0], "release.mask is 2 bytes; expected one byte for each of the 3 environments")]

@@ -82,7 +82,7 @@ pub(super) fn run(args: &AuditArgs) -> Result<ExitCode> {
             recorded.into_iter().map(AuditedPolicy::Recorded).collect::<Vec<_>>()
         }
     };
-    // Audit one policy after the other, and print the result of each.
+    // Audit one policy after the other, and print the differences that each audit finds.
     let stop = StopFlag::on_signals().map_err(system("wait for signals"))?;
     let servers = reconnecting_servers(&server_args(args)?, args.wait, &stop)?;
     let max_episodes = if args.all { usize::MAX } else { args.episodes };

@@ -33,11 +33,13 @@ pub(super) fn checked_by(by: &str, environment: &Environment) -> Result<String, 
 
 /// Returns a table of the success in each test, grouped by `by`: a parameter's name, or `context`.
 ///
-/// A grid or a list has a row for each value of the parameter. If the parameter is drawn, each tenth of its range has a
-/// row. The rows of a test are ordered by success rate and then by mean return, lowest first.
+/// A grid or a list has a row for each value of the parameter. If the parameter is drawn, its range is divided into
+/// about ten equal bins, and each bin with episodes has a row. Tests in which the parameter has a single value are left
+/// out. The rows of a test are ordered by success rate and then by mean return, lowest first.
 ///
 /// # Errors
-/// [`CommandError::Usage`] if there is no such parameter, or if it has a single value in every test.
+/// [`CommandError::Usage`] if there is no such parameter, or if no test is left. For `context`, no test is left if none
+/// is on a grid or a list.
 pub(super) fn table_by(records: &Records, criterion: Option<&Criterion>, by: &str) -> Result<Table> {
     let mut rows = Vec::new();
     for test in &records.about.tests {
@@ -58,8 +60,11 @@ pub(super) fn table_by(records: &Records, criterion: Option<&Criterion>, by: &st
         rows.append(&mut groups);
     }
     if rows.is_empty() {
-        let hint = if by == CONTEXT { "name a parameter, or test on a grid or a list" } else { "it has one value" };
-        return Err(CommandError::Usage(format!("--by {by}: no test can be told apart by it; {hint}")));
+        let hint = match by {
+            CONTEXT => "name a parameter, or test on a grid or a list",
+            _ => "it has one value in each test",
+        };
+        return Err(CommandError::Usage(format!("--by {by}: no test can be divided by it: {hint}")));
     }
     let table = Table::builder("", &rows)
         .text("tested on", |row| row.set)
@@ -85,7 +90,8 @@ impl ValueGroup<'_> {
 }
 
 /// Groups the episodes of a test by `by`. Returns the label of each group with the positions of its episodes in the
-/// test, in the order of the values. The result is empty if all episodes have the same value.
+/// test, in the order of the values. The result is empty if all episodes have the same value of the parameter. For
+/// `context`, it is empty if the test is not on a grid or a list.
 fn labels(records: &Records, set: &str, by: &str, contexts: &Contexts) -> Result<Vec<(String, Vec<usize>)>> {
     let outcomes = Outcomes::new(records, set);
     if by == CONTEXT {

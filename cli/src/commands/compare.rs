@@ -170,6 +170,7 @@ fn policy_at(path: &Path) -> Result<ComparedPolicy> {
 }
 
 /// Returns the sets to compare on: those of the arguments, or else the sets that all recorded tests have in common.
+/// Without recorded tests, the default is D, R and E.
 fn tested_sets(args: &CompareArgs, conditions: &[NamedPolicies]) -> Result<Vec<TestSet>> {
     let is_given = !args.versions.is_empty() || !args.set.parameters.is_empty() || args.set.contexts.is_some();
     let policies = conditions.iter().flat_map(|condition| &condition.policies);

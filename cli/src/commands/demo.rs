@@ -43,12 +43,12 @@ const GRID: usize = 12;
 const POINT_EPISODES: u64 = 5;
 /// Maximum number of seeds that are tried to find an episode to film.
 const MAX_TRIES: u64 = 20;
-/// Width and height of the films.
+/// Width and height of the films' pictures without the captions below them, in pixels.
 const PIXELS: (u32, u32) = (240, 240);
 /// Number of steps between two frames of the films. Not every step is drawn, because a robot's frame takes about 60 ms.
 const FRAME_STEPS: u32 = 8;
 
-/// A trained policy with its success rate on each version, in percent.
+/// A trained policy with its success rates on D, R and E, in percent.
 struct DemoPolicy {
     version: Version,
     checkpoint: Checkpoint,
@@ -93,8 +93,8 @@ impl Demo<'_> {
         writeln!(
             out,
             "{}: PPO with feed-forward networks is trained on default physics (D)\n\
-             and on random physics (R), and tested on both and on extreme physics (E), which\n\
-             neither has met.\n",
+             and on random physics (R), and tested on both and on extreme physics (E), on\n\
+             which neither policy was trained.\n",
             environment.name
         )?;
         let [on_d, on_r] = TRAINED_ON;
@@ -132,7 +132,7 @@ impl Demo<'_> {
         self.args.episodes.unwrap_or(budget(environment).0)
     }
 
-    /// Trains a policy and tests it on every version.
+    /// Trains a policy and tests it on D, R and E.
     fn train(&self, environment: &str, version: Version) -> Result<DemoPolicy> {
         let DemoArgs { test_episodes, seed, .. } = *self.args;
         let episodes = self.episodes(environment);

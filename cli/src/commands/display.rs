@@ -1,4 +1,5 @@
-//! Progress on standard error. A terminal shows a bar that fits its width; other outputs get plain lines.
+//! Messages and progress on standard error, and text on standard output. A terminal shows progress as a bar that fits
+//! its width; other outputs get plain lines.
 
 use std::io::{IsTerminal, Write};
 use std::sync::atomic::{AtomicBool, Ordering};

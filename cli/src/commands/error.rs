@@ -172,7 +172,7 @@ fn with_searched_folders(error: &CheckpointError) -> String {
 fn with_task_hint(error: &ClientError) -> String {
     match error {
         ClientError::NoEnvironment(UnknownEnvironment::Name { .. }) => {
-            format!("{error}; a task of a folder needs --task DIR, here or at the server")
+            format!("{error}; an environment of a task folder needs --task DIR, of this command or of the server")
         }
         _ => error.to_string(),
     }

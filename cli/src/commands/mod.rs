@@ -49,7 +49,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
-    let _ = perturb_system::ignore_sigxfsz(); // if it fails, the program only ends when a file exceeds the size limit
+    let _ = perturb_system::ignore_sigxfsz(); // if it fails, writing beyond `ulimit -f` ends the program
     let cli = Cli::from_process(|warning| {
         // `perturb` has printed the warning before it replaced itself by perturb-recurrent.
         if !recurrent::is_replacement() {
@@ -85,8 +85,9 @@ pub fn main() -> ExitCode {
             | CliCommand::Curves(_)
             | CliCommand::Serve(_)
     ) {
-        // Signals end these commands at once, because they have nothing to finish. The other commands check a flag. If
-        // the handler cannot be installed, signals have their default effect, which also ends the program.
+        // Signals end these commands at once, because they have nothing to finish. Commands that play episodes check a
+        // flag instead. In all other commands, and if the handler cannot be installed, signals have their default
+        // effect, which also ends the program.
         let _ = end_on_signals();
     }
     let success = |()| ExitCode::SUCCESS;
@@ -144,9 +145,9 @@ fn reconnecting_servers(args: &ServerArgs, wait: WaitArgs, stop: &StopFlag) -> R
     Ok(servers(args, stop)?.with_wait(ServerWait { limit: wait.time(), tell: |sentence| note(sentence) }))
 }
 
-/// Returns the servers for `jobs` simultaneous processes. All processes share the servers of --server. Without it, each
-/// process gets a private server, because a server's single transport thread serves all its clients, and processes with
-/// short steps would wait for each other.
+/// Returns the servers for `jobs` simultaneous processes. All processes share the servers of --server. Without
+/// --server, each process gets a private server. A private server has a single transport thread, so processes with
+/// short steps that shared it would wait for each other.
 fn servers_of_jobs(args: &ServerArgs, jobs: usize, stop: &StopFlag) -> Result<(Vec<PrivateServer>, Vec<Address>)> {
     check_server_args(args)?;
     if !args.server.is_empty() {
@@ -159,8 +160,8 @@ fn servers_of_jobs(args: &ServerArgs, jobs: usize, stop: &StopFlag) -> Result<(V
     Ok((servers, addresses))
 }
 
-/// Returns the number of physics threads for each of `jobs` private servers: one for each core, but all servers
-/// together have at most two for each core.
+/// Returns the number of physics threads for each of `jobs` private servers: one for each core. If all servers together
+/// would then have more than two threads for each core, each server has fewer, but at least one.
 ///
 /// The limit comes from a measurement on two cores. Two simultaneous processes took the same time with one thread each
 /// and with two threads each. A process that ran alone took a quarter less time with two threads.
@@ -188,7 +189,7 @@ fn check_models(servers: &Servers, plan: &Plan, folder: &ExperimentFolder) -> Re
 fn require_file(path: &Path, remedy: &str) -> Result<()> {
     let wrong = match path.metadata() {
         Ok(metadata) if metadata.is_dir() => format!("{} is a folder", path.display()),
-        Ok(metadata) if !metadata.is_file() => format!("{} is a pipe or a device, no plain file", path.display()),
+        Ok(metadata) if !metadata.is_file() => format!("{} is a pipe or a device, not a regular file", path.display()),
         Err(error) if matches!(error.kind(), ErrorKind::NotFound | ErrorKind::NotADirectory) => {
             format!("there is no file {}", path.display())
         }
@@ -253,7 +254,7 @@ fn check_server_args(args: &ServerArgs) -> Result<()> {
         let wrong = match folder.join("task.toml").is_file() {
             true => continue,
             false if folder.is_dir() => "has no file task.toml",
-            false if folder.exists() => "is no folder",
+            false if folder.exists() => "is not a folder",
             false => "does not exist",
         };
         return Err(CommandError::Usage(format!(
@@ -307,7 +308,7 @@ mod tests {
         std::fs::write(&file, "").unwrap();
         assert!(require_file(&file, "give one").is_ok());
         assert!(refused(&file.join("below")).starts_with("there is no file "));
-        assert_eq!(refused(Path::new("/dev/zero")), "/dev/zero is a pipe or a device, no plain file: give one");
+        assert_eq!(refused(Path::new("/dev/zero")), "/dev/zero is a pipe or a device, not a regular file: give one");
     }
 
     #[rstest]
@@ -320,7 +321,7 @@ mod tests {
     #[case(2, 64, 64)]
     #[case(64, 64, 2)]
     #[case::nothing_to_do(0, 2, 2)]
-    fn private_servers_have_at_most_two_threads_for_each_core(
+    fn private_servers_share_two_threads_for_each_core_or_have_one_each(
         #[case] jobs: usize,
         #[case] cores: usize,
         #[case] each: usize,

@@ -98,7 +98,7 @@ fn groups_line(groups: &[Vec<usize>], Grouping { at_a_time, .. }: Grouping) -> S
 }
 
 /// Estimates and prints how long the plan takes. A cell's duration is taken from finished cells of the same environment
-/// and method. Without such cells it is measured, which gives an upper bound.
+/// and method. Without such cells it is measured, which gives an upper bound. --measure 0 measures nothing.
 fn estimate(
     args: &PlanArgs,
     plan: &Plan,
@@ -144,13 +144,14 @@ fn estimate(
         if let Some((folder, _)) = finished {
             let left = |&cell: &usize| !folder.cell(&plan.cells[cell].id).is_settled(true);
             let left: Vec<usize> = (0..seconds.len()).filter(left).collect();
-            writeln!(out, "unfinished there, {}: {}", cells(left.len()), total(&mut left.iter().copied()))?;
+            let (path, time) = (folder.path().display(), total(&mut left.iter().copied()));
+            writeln!(out, "unfinished in {path}, {}: {time}", cells(left.len()))?;
         }
     }
     Ok(())
 }
 
-/// Measures groups of cells that represent all kinds of `cells`, and prints their speeds.
+/// Measures groups of cells that cover each environment and each method of `cells`, and prints their speeds.
 fn measurements(
     args: &PlanArgs,
     plan: &Plan,

@@ -1,7 +1,7 @@
 //! Replaces this process with `perturb-recurrent`, which is the same program with libtorch.
 //!
-//! Only the gradients of recurrent policies need libtorch. It is a separate program because libtorch takes most of a
-//! second to load.
+//! Only the gradients of recurrent policies need libtorch. `perturb-recurrent` is a separate program because libtorch
+//! takes most of a second to load.
 
 use std::ffi::OsStr;
 use std::os::unix::process::CommandExt;
@@ -22,13 +22,15 @@ const STARTED_BY: &str = "PERTURB_STARTED_BY";
 const OPENBLAS_THREADS: &str = "OPENBLAS_NUM_THREADS";
 
 /// Replaces this process with `perturb-recurrent` if training `architecture` needs libtorch. The new program has the
-/// same arguments and process id. Returns if libtorch is not needed, or if this already is `perturb-recurrent`.
+/// same arguments and process id. Returns if libtorch is not needed, or if this already is `perturb-recurrent` with the
+/// right number of threads.
 ///
 /// The new program runs OpenBLAS with one thread. More threads are slower for networks this small, and change the
-/// results of sums. If the user has set another number of threads, it is kept unless `one_thread` is true.
+/// results of sums. If the user has set another number of threads, it is kept unless `one_thread` is true. OpenBLAS
+/// reads the number before `main`, so `perturb-recurrent` replaces itself to change the number.
 ///
 /// # Errors
-/// [`CommandError::Usage`] if `perturb-recurrent` is missing or of another version.
+/// [`CommandError::Usage`] if `perturb-recurrent` cannot be started or has another version.
 pub(super) fn prepare(architecture: Architecture, one_thread: bool) -> Result<()> {
     if architecture == Architecture::Ff {
         return Ok(());
@@ -81,7 +83,7 @@ pub(super) fn set_one_thread(command: &mut Command) {
     command.env(OPENBLAS_THREADS, "1");
 }
 
-/// Tells whether this process is `perturb-recurrent` and has replaced `perturb`.
+/// Tells whether [`prepare`] has started this process, or a process from which this one inherits its environment.
 pub(super) fn is_replacement() -> bool {
     std::env::var_os(STARTED_BY).is_some()
 }

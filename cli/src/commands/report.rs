@@ -55,12 +55,12 @@ pub(super) fn write(sources: ReportInputs, out: Option<PathBuf>, page: Option<&P
     })
 }
 
-/// Returns the default folder of a report, which is report/ in the experiment's folder. Refuses reports with
-/// assessments, which do not belong to the experiment; --out is then required.
+/// Returns the default folder of a report: report/ in the experiment's folder, or report/RULE/ for another selection
+/// rule than the plan's. Refuses reports with assessments or of a results table, because they belong to no experiment's
+/// folder; --out is then required.
 fn default_folder(sources: &ReportInputs) -> Result<PathBuf> {
     let Some(folder) = sources.folder.as_ref().filter(|_| sources.assessed.is_empty()) else {
-        let message =
-            "give --out: a report with assessments or of a results table is written to no experiment's folder";
+        let message = "give --out: a report with assessments or of a results table has no default folder";
         return Err(CommandError::Usage(message.into()));
     };
     let mut out = folder.path().join("report");

@@ -43,10 +43,12 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
         return Err(CommandError::Usage(message));
     }
-    // The run creates --out and the folders above it, so the folder of a page in one of them need not exist yet.
+    // The run creates --out, the folders above it and the report's folder. So the folder of the --html page need not
+    // exist yet if it is one of these.
     let is_created = |page: &Path| {
-        let is_related = |folder: &Path| args.out.starts_with(folder) || folder.starts_with(&args.out);
-        !page.exists() && page.parent().is_some_and(is_related)
+        let is_created_folder =
+            |folder: &Path| args.out.starts_with(folder) || folder.starts_with(args.out.join("report"));
+        !page.exists() && page.parent().is_some_and(is_created_folder)
     };
     args.html.iter().filter(|page| !is_created(page)).try_for_each(|page| require_writable(page))?;
     let table = args.done.as_deref().map(ResultsTable::read).transpose()?;
@@ -80,7 +82,7 @@ fn find_cell<'a>(args: &RunArgs, plan: &'a Plan, name: &str) -> Result<&'a Cell>
 /// standard output.
 fn run_worker(args: &RunArgs, folder: &ExperimentFolder, stop: &StopFlag) -> Result<ExitCode> {
     let mut text = String::new();
-    std::io::stdin().lock().read_line(&mut text).map_err(system("read the order"))?;
+    std::io::stdin().lock().read_line(&mut text).map_err(system("read the job"))?;
     let job: WorkerJob = serde_json::from_str(&text)
         .map_err(|error| CommandError::Usage(format!("the job on standard input is not valid: {error}")))?;
     stop_at_end_of_input(stop)?;
@@ -189,8 +191,9 @@ fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> V
 
 /// Returns an upper bound of each cell's duration in seconds, for the estimate of the remaining time.
 ///
-/// Here the kind of a cell is its environment and method. If a kind's first cells begin at once, their durations will
-/// soon be known for all cells of the kind, so these cells have `None`. Only cells of the other kinds are measured.
+/// Here the kind of a cell is its environment and method. If cells of a kind begin at once, their durations will soon
+/// be known, and predict those of all other cells of the kind. Cells of such a kind have `None`. Cells of a kind with
+/// finished cells also have `None`. All others are measured. The result is empty if nothing was measured.
 fn upper_bounds(
     args: &RunArgs,
     servers: &Servers,

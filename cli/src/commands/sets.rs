@@ -16,7 +16,7 @@ use super::require_file;
 /// Name of the test set that --parameters makes.
 const PARAMETERS_SET: &str = "parameters";
 
-/// Returns the sets to test on: `versions`, and the set of --parameters or --contexts. Returns all versions if none of
+/// Returns the sets to test on: `versions`, and the set of --parameters or --contexts. Returns D, R and E if none of
 /// these is given.
 pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<TestSet>> {
     let mut versions = versions.to_vec();
@@ -169,6 +169,6 @@ mod tests {
             "the success threshold is step=3, but must be one of steps, e.g. steps=100 (did you mean `steps`?)"
         );
         let unknown = normalize_rule(&"steps=3".parse().unwrap(), None, None).unwrap_err().to_string();
-        assert!(unknown.contains("does not say what its success rule compares"), "{unknown}");
+        assert!(unknown.contains("does not report the quantity of its success rule"), "{unknown}");
     }
 }

@@ -12,8 +12,8 @@ use super::error::{CommandError, Result, system};
 use super::{servers, sets};
 use crate::video::{Footage, Format, VideoFile, VideoOptions, film};
 
-/// Maximum number of frames that are drawn of each episode for a contact sheet. It limits the time of drawing, about 60
-/// ms for each frame of a robot.
+/// Approximate maximum number of frames that are drawn of each episode for a contact sheet. Rounding may almost double
+/// the number. The maximum limits the time of drawing, about 60 ms for each frame of a robot.
 const MAX_SHEET_FRAMES: u32 = 500;
 
 pub(super) fn run(args: &VideoArgs) -> Result<()> {

@@ -168,7 +168,8 @@ fn line_height(font_size: u32) -> u32 {
     font_size * 7 / 5
 }
 
-/// Formats a parameter with its unit and four significant digits, e.g. "density 1180 kg/m³".
+/// Formats a parameter with its unit, e.g. "density 1180 kg/m³". The value has at most four significant digits, or all
+/// digits before the decimal point if they are more.
 pub(super) fn parameter(name: &str, value: f64, unit: &str) -> String {
     let unit = if unit == "1" { String::new() } else { format!(" {unit}") };
     // Adding 0 changes -0 to 0.

@@ -11,6 +11,6 @@ pub(super) trait Encode {
     /// Marks the end of an episode.
     fn end_episode(&mut self) {}
 
-    /// Completes the file. Returns n if the file shows every n-th frame, i.e. 1 if it shows all frames.
+    /// Completes the file. Returns n if the file is a film that shows only every n-th frame, and otherwise 1.
     fn finish(self: Box<Self>) -> std::io::Result<u16>;
 }

@@ -38,8 +38,8 @@ impl Format {
     }
 }
 
-/// The file of a video before encoding begins. The video is written to a hidden temporary file in the same folder,
-/// which is deleted if the video is not completed.
+/// The file of a video before encoding begins. The video is written to a hidden temporary file in the same folder. The
+/// temporary file is deleted if the video is not completed.
 #[derive(Debug)]
 pub struct VideoFile {
     path: PathBuf,
@@ -64,7 +64,7 @@ impl VideoFile {
     }
 
     /// Returns the time for which a frame is shown at `fps` frames per second, in seconds. A GIF rounds it to
-    /// hundredths.
+    /// hundredths, and shows a frame for at least 0.02 s.
     pub fn frame_seconds(&self, fps: f64) -> f64 {
         match self.format {
             Format::Gif => f64::from(gif::delay(1.0 / fps)) / 100.0,
@@ -72,9 +72,9 @@ impl VideoFile {
         }
     }
 
-    /// Begins to encode frames of `size`: width and height in pixels, both even. Each frame is shown for 1 / `fps`
-    /// seconds or a whole multiple of that time. A GIF rounds the time to hundredths of a second. `grid` has the
-    /// numbers of sets and episodes that a contact sheet will show.
+    /// Begins to encode frames of `size`: width and height in pixels, both even. Each frame is shown for at least the
+    /// time that [`VideoFile::frame_seconds`] returns for `fps`. `grid` has the numbers of sets and episodes that a
+    /// contact sheet will show.
     ///
     /// # Errors
     /// [`VideoError::Encode`].
@@ -116,8 +116,8 @@ impl VideoWriter {
         self.encoder.end_episode();
     }
 
-    /// Completes the video and moves it to its path. Returns n if it shows every n-th frame, i.e. 1 if it shows all
-    /// frames.
+    /// Completes the video and moves it to its path. Returns n if it is a film that shows only every n-th frame, and
+    /// otherwise 1.
     ///
     /// # Errors
     /// [`VideoError::Encode`] and [`VideoError::File`]. After an error, an existing video is unchanged.
@@ -142,7 +142,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_ending_says_the_format() {
+    fn the_extension_selects_the_format() {
         for (name, format) in
             [("a.gif", Format::Gif), ("a/b.c.mp4", Format::Mp4), ("A.GIF", Format::Gif), ("a.png", Format::Png)]
         {
@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_written_is_refused_at_once() {
+    fn unwritable_paths_are_refused_at_once() {
         let folder = tempfile::tempdir().unwrap();
         fs::write(folder.path().join("file"), "").unwrap();
         fs::create_dir(folder.path().join("folder.gif")).unwrap();

@@ -56,7 +56,7 @@ pub struct Footage {
     pub episodes: Vec<Filmed>,
     /// Number of frames: one for each shown step, and one for each episode's start.
     pub frames: u64,
-    /// n if the video shows every n-th frame, i.e. 1 if it shows all frames.
+    /// n if the video is a film that shows only every n-th frame, and otherwise 1.
     pub shown_every: u16,
     /// Width and height of the video, in pixels.
     pub size: (u32, u32),
@@ -88,7 +88,8 @@ impl Footage {
 /// Calls `report` with the number of finished episodes.
 ///
 /// The film shows environment 0 of a test with the same seed, so a film of one episode shows the episode of a test with
-/// one episode. An RL² policy keeps its memory during a trial, and all episodes of the trial are filmed.
+/// one episode. An RL² policy keeps its memory during a trial. Each episode of the trial counts as an episode of the
+/// film, although a test counts only the trial's last episode.
 ///
 /// # Errors
 /// [`VideoError`]. After an error, no file is left.

@@ -194,7 +194,8 @@ mod tests {
         Box::new(GifEncoder::new(&folder.path().join("a.gif"), size, fps).unwrap())
     }
 
-    /// Returns the visible pixels, their duration, and the number of written pixels of each frame.
+    /// Returns for each frame the pixels that are visible after it, its delay in hundredths of a second, and the number
+    /// of pixels in its rectangle.
     fn decoded(folder: &tempfile::TempDir) -> Vec<(Vec<u8>, u16, usize)> {
         let mut options = gif::DecodeOptions::new();
         options.set_color_output(gif::ColorOutput::RGBA);
@@ -216,7 +217,7 @@ mod tests {
         frames
     }
 
-    /// Returns frames of `pixels` grey pixels, all of which differ.
+    /// Returns a function that makes a new frame of `pixels` random grey pixels at each call.
     fn noise(pixels: usize) -> impl FnMut() -> Vec<u8> {
         let mut state = 1_u32;
         move || {
@@ -274,7 +275,7 @@ mod tests {
         for (index, frame) in drawn.iter().enumerate() {
             encoder.write(frame, if index % 100 == 99 { 2.0 } else { 0.0 }).unwrap();
             let kept: usize = encoder.films.iter().flat_map(|film| &film.frames).map(|frame| frame.buffer.len()).sum();
-            assert!(kept <= STRIDES.len() * MAX_BYTES, "no more is kept than of each film a whole one");
+            assert!(kept <= STRIDES.len() * MAX_BYTES, "each film keeps at most a whole GIF");
         }
         let counted = encoder.films[0].bytes;
         let stride = encoder.films[0].stride;
@@ -304,11 +305,11 @@ mod tests {
             );
         }
         let delays: Vec<u16> = film.frames.iter().map(|frame| frame.delay).collect();
-        assert_eq!(delays, [300, 212, 86], "the first, the held one, and that at the first multiple");
+        assert_eq!(delays, [300, 212, 86], "the first, the held one, and the one at the first multiple");
     }
 
     #[test]
-    fn what_does_not_fit_even_so_is_refused() {
+    fn films_that_cannot_fit_are_refused() {
         let folder = tempfile::tempdir().unwrap();
         let mut encoder = encoder(&folder, (2000, 1400), 50.0);
         let error = encoder.write(&noise(2000 * 1400)(), 0.0).unwrap_err().to_string();

@@ -29,7 +29,7 @@ use perturb_report::plot::PlotError;
 #[non_exhaustive]
 #[expect(missing_docs, reason = "the sentences say what the fields are")]
 pub enum VideoError {
-    /// The policy cannot act, or the server cannot draw.
+    /// The policy cannot act, the server cannot draw, a server was lost, or a signal ended the filming.
     #[error(transparent)]
     Test(#[from] TestError),
     /// The file's name has no known extension.
@@ -38,7 +38,7 @@ pub enum VideoError {
     /// The program ffmpeg is missing or cannot encode .mp4.
     #[error(
         "an .mp4 is encoded by the program ffmpeg with its encoder libx264, but {reason}: install it, on Debian with \
-         `apt-get install ffmpeg`, or write a .gif, which needs nothing"
+         `apt-get install ffmpeg`, or write a .gif, which needs no other program"
     )]
     NoFfmpeg {
         /// Why ffmpeg cannot be used.

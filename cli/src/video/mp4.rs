@@ -33,8 +33,8 @@ pub(super) fn find_ffmpeg() -> Result<(), VideoError> {
 /// An encoder that sends frames to an ffmpeg process. Dropping it ends the process.
 pub(super) struct Mp4Encoder {
     child: Child,
-    /// Standard error of ffmpeg. It is a file and not a pipe, because a pipe would not be read while frames are
-    /// written.
+    /// Standard error of ffmpeg. It is a file and not a pipe. A pipe would not be read while frames are written, so
+    /// ffmpeg would block when the pipe is full.
     stderr_file: File,
     size: (u32, u32),
     fps: f64,
@@ -58,7 +58,7 @@ impl Mp4Encoder {
             .stdin(Stdio::piped())
             .stdout(Stdio::null())
             .stderr(stderr_file.try_clone()?)
-            // Ctrl-C is handled by this process, which then ends ffmpeg.
+            // In its own process group, ffmpeg does not receive Ctrl-C. This process receives it and ends ffmpeg.
             .process_group(0)
             .spawn()
             .map_err(|error| io::Error::other(format!("`{PROGRAM}` cannot be started: {error}")))?;

@@ -3,7 +3,8 @@
 use std::cmp::Reverse;
 use std::collections::HashMap;
 
-/// The palette index that marks a pixel as unchanged since the last frame. It is 0, so that indices are small numbers.
+/// The palette index that marks a pixel as unchanged since the last frame. It is 0 and not 255, because a frame's
+/// largest index determines the minimum size of its LZW codes.
 pub(super) const UNCHANGED: u8 = 0;
 /// Maximum number of colours. A GIF has 256 indices, and one is [`UNCHANGED`].
 const MAX_COLOURS: usize = 255;
@@ -16,7 +17,9 @@ const MIN_NEW_DISTANCE: u32 = 16;
 
 type PixelColour = [u8; 3];
 
-/// A palette of up to 255 colours. It maps every colour to its nearest colour in the palette.
+/// A palette of up to 255 colours. When a colour occurs for the first time, it is mapped to the nearest colour of the
+/// palette. If that is too far away and the palette has room, the colour is added instead. The mapping then never
+/// changes.
 pub(super) struct Palette {
     colours: Vec<PixelColour>,
     /// The palette index of each of the 2²⁴ colours, at the position red · 2¹⁶ + green · 2⁸ + blue; 0 for a colour that

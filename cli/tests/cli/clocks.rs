@@ -11,9 +11,10 @@ use crate::common::{ended, perturb, stderr};
 use crate::guarded::weights;
 use crate::patience::PPO_CART_POLE;
 
-/// Environment variable. If it is set, the test fails if libfaketime is missing; otherwise it is skipped.
+/// Environment variable that decides about a missing libfaketime. If it is set, the test fails. If it is not set, the
+/// test is skipped.
 const REQUIRED: &str = "PERTURB_FAKETIME_REQUIRED";
-/// Path of libfaketime in Debian's library folder.
+/// Path of libfaketime, relative to the system's library folder.
 const LIBRARY: &str = "faketime/libfaketime.so.1";
 /// Offsets of the time of day, which are set one after the other.
 const JUMPS: [&str; 5] = ["+0", "-2h", "+400d", "-30d", "+3s"];

@@ -16,7 +16,7 @@ use tempfile::TempDir;
 pub const LIMIT: Duration = Duration::from_secs(300);
 
 pub fn server(workers: usize) -> PrivateServer {
-    perturb_torch::register(); // for what trains on it in this process
+    perturb_torch::register(); // trainings of this process may use the server for recurrent policies
     PrivateServer::start(Some(workers)).unwrap_or_else(|error| panic!("{error}"))
 }
 
@@ -43,8 +43,8 @@ pub fn perturb(arguments: &[&str]) -> Command {
     command
 }
 
-/// Returns the status and the messages of a refused command, for a snapshot. `names` replaces texts that differ from
-/// run to run.
+/// Runs a command that must be refused. Returns the command, its exit status and its messages, for a snapshot. `names`
+/// has the texts that differ from run to run, each with its replacement.
 #[track_caller]
 pub fn refusal(arguments: &[&str], names: &[(&str, &str)]) -> String {
     let output = perturb(arguments).output().expect("perturb runs");

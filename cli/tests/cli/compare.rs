@@ -43,7 +43,7 @@ fn conditions_are_compared_over_seeds_and_episodes() {
     let by_length = printed(&[&evaluate[..], &episodes, &["--by", "length"]].concat());
     assert!(by_length.contains("length"), "{by_length}");
     let recorded = printed(&["compare", &format!("a={records}"), &format!("b={records}"), "--score", "return"]);
-    assert!(recorded.contains("+0.0 [+0.0, +0.0] over episodes: one seed of each says nothing"), "{recorded}");
+    assert!(recorded.contains("+0.0 [+0.0, +0.0] over episodes: one seed each supports no conclusion"), "{recorded}");
     let rescored = printed(&["rescore", &records, "--by", "length"]);
     let rates: Vec<f64> = rescored
         .lines()

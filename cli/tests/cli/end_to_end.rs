@@ -161,10 +161,11 @@ fn rollouts_keep_what_a_recurrent_policy_remembers() {
     let starts: Vec<usize> = second.starts().iter().enumerate().filter(|(_, start)| **start).map(|(i, _)| i).collect();
     assert_eq!(starts, [100, 101], "after 200 steps");
     let last_values = first.trajectories().expect("a finished rollout").last_values;
-    assert_eq!(last_values, &second.values()[..N_ENVS], "looking ahead moves nothing on");
+    assert_eq!(last_values, &second.values()[..N_ENVS], "computing the last values does not advance the memory");
 }
 
-/// Each rollout begins with its own memory, and an episode's end resets it.
+/// libtorch evaluates each rollout from the memory that the policy had at its start, and resets the memory after the
+/// end of an episode.
 #[test]
 fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
     let server = [server(1)];
@@ -176,7 +177,7 @@ fn libtorch_sees_the_values_that_a_recurrent_policy_saw() {
         let torch = TorchPolicy::new(spec, policy.flat_weights()).expect("a policy");
         Vec::<f32>::from(torch.evaluate(&sequences, &Tensor::of_slice(&vec![0.0f32; starts.len()])).values)
     };
-    // Values of order 1, as in the tests of the policy.
+    // The tolerance is for values of order 1, as in learner/tests/learner/gradients.rs.
     let close = |got: &[f32], expected: &[f32]| {
         got.len() == expected.len() && got.iter().zip(expected).all(|(got, expected)| (got - expected).abs() < 1e-5)
     };
@@ -214,7 +215,7 @@ fn every_test_episode_begins_without_memories() {
     let mut weights = TrainablePolicy::new(spec.clone(), 1).expect("a policy").weights();
     for array in &mut weights {
         array.data = match array.name.as_str() {
-            "lstm.bias" => vec![20.0, 20.0, 0.1, 20.0], // keeps all, adds tanh 0.1 a step, shows all
+            "lstm.bias" => vec![20.0, 20.0, 0.1, 20.0], // the gates are open: a step adds tanh 0.1 to the cell
             "policy.weight" => vec![0.0, 1e4],
             "policy.bias" => vec![0.0, -1e4 * 0.55f32.tanh()],
             _ => vec![0.0; array.data.len()],
@@ -228,7 +229,8 @@ fn every_test_episode_begins_without_memories() {
     };
     let first_episodes = length(100);
     let ten_of_each = length(1000);
-    // Random initial states change the length of an episode by about 1 step, and a mean of 100 lengths by 0.1.
+    // A test plays in at most 100 environments, so 100 episodes are the first of each, and 1000 are ten of each. Random
+    // initial states change the length of an episode by about 1 step, and a mean of 100 lengths by about 0.1.
     assert!((first_episodes - ten_of_each).abs() < 0.5, "{first_episodes} {ten_of_each}");
 }
 

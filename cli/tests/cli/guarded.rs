@@ -110,7 +110,8 @@ impl Drop for Guarded {
     }
 }
 
-/// Returns the final weights of a training: the name of their file, which has the number of episodes, and its bytes.
+/// Returns the final weights of a training: the name of their file, which contains the number of iterations, and the
+/// file's bytes.
 pub fn weights(run: &Path) -> (String, Vec<u8>) {
     let files = std::fs::read_dir(run.join("checkpoint")).expect("a checkpoint");
     let mut files = files.map(|file| file.expect("a file").path());
@@ -124,10 +125,10 @@ pub fn weights(run: &Path) -> (String, Vec<u8>) {
 #[case::no_certificate(Has { cert: None, ..ALL }, "R", "asks for a client's certificate; set PERTURB_CERT")]
 #[case::wrong_certificate(Has { cert: Some("stranger"), ..ALL }, "R", "accepts no client with the certificate")]
 #[case::expired_certificate(Has { cert: Some("old"), ..ALL }, "R", "the certificate of PERTURB_CERT has expired")]
-#[case::no_token(Has { token: None, ..ALL }, "R", "asks for a token")]
+#[case::no_token(Has { token: None, ..ALL }, "R", "requires a token")]
 #[case::wrong_token(Has { token: Some("another"), ..ALL }, "R", "does not know the token")]
 #[case::wrong_role(ALL, "E", "a token of the role \"train\" may not draw from")]
-fn who_lacks_something_is_told_at_once_what(#[case] has: Has, #[case] version: &str, #[case] part: &str) {
+fn wrong_credentials_are_refused_at_once_with_the_reason(#[case] has: Has, #[case] version: &str, #[case] part: &str) {
     let guarded = Guarded::start();
     let refused = guarded.train(&guarded.address, "bad", version, has);
     let words = stderr(&refused);
@@ -159,7 +160,7 @@ fn a_changed_byte_never_changes_what_is_learnt(#[case] is_servers: bool, #[case]
     for place in places {
         let fault = Some(ByteFault { at: place, kind: FaultKind::BitFlip });
         let course = move |number| {
-            let fault = fault.filter(|_| number == 0); // of the first connection
+            let fault = fault.filter(|_| number == 0); // only the first connection is faulty
             let [from_server, from_client] = if is_servers { [fault, None] } else { [None, fault] };
             FaultPlan { from_server, from_client, ..FaultPlan::default() }
         };
@@ -168,13 +169,13 @@ fn a_changed_byte_never_changes_what_is_learnt(#[case] is_servers: bool, #[case]
         let trained = guarded.train(&format!("https://{}", line.address()), &out, "R", ALL);
         println!("a byte changed at {place}: status {}, {}", trained.status, stderr(&trained).trim());
         if trained.status.success() {
-            assert!(weights(&guarded.file(&out)) == truth, "the byte at {place} was believed");
+            assert!(weights(&guarded.file(&out)) == truth, "the changed byte at {place} changed the weights");
             outlived += line.faults();
         } else {
             assert!(line.faults() > 0, "nothing was wrong: {}", stderr(&trained));
         }
         reached += line.faults();
     }
-    assert!(reached >= 3, "only {reached} of the bytes ever came");
-    assert!(outlived > 0, "no training went on after one");
+    assert!(reached >= 3, "only {reached} faults happened");
+    assert!(outlived > 0, "no training survived a fault");
 }

@@ -103,13 +103,13 @@ fn a_ledger_proves_training_apart_from_test_sets() {
     let tested = kept.evaluate("tester", "policy", "8");
     assert!(tested.status.success(), "{}", stderr(&tested));
     let (clean, words) = kept.audit("policy", &[]);
-    assert!(clean && words.contains("\"trainer\" drew its training in 1 session"), "{words}");
+    assert!(clean && words.contains("the training was drawn with \"trainer\" in 1 session"), "{words}");
     let head = words.split("--head ").nth(1).expect("the chain's end").trim();
     assert!(kept.audit("policy", &["--head", head]).0, "what was printed can be asked for");
     let (clean, words) = kept.audit("policy", &["--head", &head.replace(|digit: char| digit.is_ascii_digit(), "x")]);
     assert!(!clean && words.contains("no line has the digest"), "{words}");
 
-    // The client `tester` plays on E before the training is finished.
+    // The token `tester` drew from E in the test above, before this training was finished.
     kept.train("tester", "R", "leaked");
     assert!(kept.evaluate("tester", "leaked", "9").status.success());
     let (clean, words) = kept.audit("leaked", &[]);

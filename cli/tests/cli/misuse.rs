@@ -12,7 +12,7 @@ use tempfile::TempDir;
 
 use crate::common::{child_server, ended, kill, stderr, wait_for, wait_for_server};
 
-/// A plan with two cells of a few seconds.
+/// A plan with two cells that are long enough to be interrupted.
 const PLAN: &str = "environments = ['CartPole']\nversions = ['D']\nruns = 2\ntest_episodes = 12
 settings = { episodes = 100000 }\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\n";
 
@@ -156,6 +156,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
         vec!["perturb", "plan", "plan.toml", "--timings-from", "missing"],
         vec!["perturb", "run", "wrong.toml", "--out", "out"],
         vec!["perturb", "run", "plan.toml", "--out", "out", "--html", "missing/page.html"],
+        vec!["perturb", "run", "plan.toml", "--out", "out", "--html", "out/missing/page.html"],
         vec!["perturb", "run", "plan.toml", "--out", "out", "--json", "missing/lines.jsonl"],
         vec!["perturb", "run", "plan.toml", "--out", "run"],
         vec!["perturb", "run", "plan.toml", "--out", "file"],
@@ -195,7 +196,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 #[case::train(
     "perturb train --env CartPole --episodes 1000000 --out run",
     "run/progress.csv",
-    "stopped by signal N after N of N episodes; go on with: perturb train --resume run",
+    "stopped by signal N after N of N episodes; resume it with: perturb train --resume run",
     "run, run/checkpoint, run/config.toml, run/events.out.tfevents.N.perturb, run/lock, run/monitor.csv, run/progress.csv"
 )]
 #[case::run(
@@ -246,7 +247,8 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
     }
     let before = place.files();
     let child = place.start(&words.split(' ').collect::<Vec<_>>());
-    // A command has begun when its private server has made a folder.
+    // With `tmp`, a command has begun when its private server runs and the server's folder exists. Otherwise `begun` is
+    // a file that the command writes.
     let has_begun = || match begun {
         "tmp" => {
             child_server(child.id()).is_some() && place.path("tmp").read_dir().is_ok_and(|mut tmp| tmp.next().is_some())
@@ -261,7 +263,7 @@ fn ctrl_c_ends_soon_and_leaves_nothing_temporary(
     let words = stderr(&output);
     let last = words.lines().last().unwrap_or_default();
     let last = without_numbers(last);
-    // On a busy machine the signal may come before the server has started.
+    // On a busy machine the signal may come before the server listens.
     let is_early = begun == "tmp" && last.starts_with("perturb: stopped by signal N while ");
     assert!(last == said || is_early, "{words}");
     let left: Vec<String> = place.files().difference(&before).cloned().collect();
@@ -362,7 +364,7 @@ fn quiet_prints_nothing_and_json_goes_to_stdout() {
 }
 
 #[test]
-fn that_nobody_reads_standard_error_ends_nothing() {
+fn a_full_standard_error_does_not_end_a_training() {
     let place = Place::new();
     let mut command =
         place.command(&["perturb", "-vv", "train", "--env", "CartPole", "--episodes", "5", "--out", "run"]);

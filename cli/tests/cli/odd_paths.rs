@@ -8,7 +8,7 @@ use serde_json::Value;
 use crate::common::{perturb, stderr};
 
 #[test]
-fn a_run_whose_path_is_no_text_is_trained_and_listed() {
+fn runs_with_odd_paths_are_trained_and_listed() {
     let folder = tempfile::tempdir().expect("a directory");
     let runs = folder.path().join("runs");
     for name in [OsStr::from_bytes(b"latin\xfc"), OsStr::new("new\nline")] {
@@ -33,7 +33,7 @@ fn a_run_whose_path_is_no_text_is_trained_and_listed() {
 }
 
 #[test]
-fn a_temporary_folder_that_is_no_text_is_named() {
+fn a_temporary_folder_that_is_not_utf8_is_refused() {
     let folder = tempfile::tempdir().expect("a directory");
     let temporary = folder.path().join(OsStr::from_bytes(b"latin\xfc"));
     std::fs::create_dir(&temporary).expect("a folder");

@@ -29,7 +29,7 @@ impl Place {
         command
     }
 
-    /// Returns the number of folders that private servers have made.
+    /// Returns the number of folders of private servers.
     fn folders(&self) -> usize {
         self.path("tmp").read_dir().expect("a list").count()
     }
@@ -60,7 +60,7 @@ fn a_server_ends_when_its_learner_is_killed_at_the_start() {
     command.env("PERTURB_SERVER", late).env("LATE_FOLDER", place.path("")).env("LATE_PROGRAM", program);
     let mut child = command.spawn().expect("perturb");
     let begun = || std::fs::read_to_string(place.path("begun")).unwrap_or_default();
-    wait_for("what will be the server", || begun().ends_with('\n'));
+    wait_for("the start of the late server", || begun().ends_with('\n'));
     let server = begun().trim().parse().expect("a process's number");
     assert_eq!((place.folders(), is_running(server)), (1, true));
     child.kill().expect("kill -9");

@@ -8,7 +8,8 @@ use rstest::rstest;
 
 use crate::common::{stderr, wait_for_server};
 
-/// Environment variable. If it is set, the test fails if qemu is missing; otherwise it is skipped.
+/// Environment variable that decides about a missing qemu. If it is set, the test fails. If it is not set, the test is
+/// skipped.
 const REQUIRED: &str = "PERTURB_QEMU_REQUIRED";
 const QEMU: &str = "qemu-x86_64";
 
@@ -63,8 +64,8 @@ fn every_processor_learns_the_same_weights(
     )]
     algorithm: &[&str],
 ) {
-    let qemu = Command::new(QEMU).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
-    if !qemu.is_ok_and(|status| status.success()) {
+    let status = Command::new(QEMU).arg("--version").stdout(Stdio::null()).stderr(Stdio::null()).status();
+    if !status.is_ok_and(|status| status.success()) {
         assert!(std::env::var_os(REQUIRED).is_none(), "{QEMU} is missing: install qemu-user");
         eprintln!("skipped: {QEMU} is missing (Debian's package qemu-user); `make qemu-test` installs it");
         return;

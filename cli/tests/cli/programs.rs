@@ -213,7 +213,7 @@ fn an_extended_training_equals_one_of_the_larger_budget() {
     of("part", "40");
     let done = checkpoint("part").state.counters.episodes;
     let output = run(folder.path(), &["train", "--resume", "part", "--extend", "20"]);
-    let budget = done + 20; // it may have had more than its 40
+    let budget = done + 20; // `done` may be more than 40
     assert!(stderr(&output).contains(&format!(" of {budget} episodes, the new budget")), "{}", stderr(&output));
     of("whole", &budget.to_string());
     assert_eq!(checkpoint("part"), checkpoint("whole"));

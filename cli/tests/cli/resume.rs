@@ -19,9 +19,9 @@ use insta::assert_snapshot;
 use serde_json::Value;
 use tempfile::TempDir;
 
-/// Settings of trainings with every algorithm and architecture, discrete and continuous actions, and MuJoCo. Rollouts
-/// end within episodes, checkpoints are frequent and fall between two lines of progress.csv, and no interval is a
-/// multiple of another.
+/// Settings of trainings with A2C, PPO, EPOpt and RL², both architectures, discrete and continuous actions, and MuJoCo.
+/// Rollouts end within episodes, except with EPOpt. Checkpoints are frequent. If `log_interval` is above 1, some of
+/// them fall between two lines of progress.csv.
 const RUNS: [&str; 9] = [
     "environment = 'CartPole'\nversion = 'E'\nalgorithm = 'a2c'\nepisodes = 90\nnum_envs = 5\nn_steps = 5\nlog_interval = 3\n\
      checkpoint_interval = 7",
@@ -70,7 +70,7 @@ fn names(directory: &Path) -> Vec<String> {
     names
 }
 
-/// Returns the rows of a log with its header, without the columns of times.
+/// Returns the rows of a log without its header, and without the columns of times.
 fn cells(run: &Path, name: &str) -> Vec<Vec<String>> {
     let text = read(run, name);
     let mut lines = text.lines().filter(|line| !line.starts_with('#')).map(|line| line.split(','));
@@ -94,7 +94,8 @@ fn events(run: &Path) -> PathBuf {
     run.join(name)
 }
 
-/// Checks that two runs have the same weights, checkpoints and logs, byte for byte.
+/// Checks that two runs have equal checkpoints, with the same bytes of weights and state, and logs that differ only in
+/// times.
 #[track_caller]
 fn assert_same(got: &Path, expected: &Path) {
     assert_eq!(Checkpoint::load(got).expect("a checkpoint"), Checkpoint::load(expected).expect("a checkpoint"));
@@ -202,7 +203,8 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
     }
 }
 
-/// Copies of the directory simulate kills in every iteration of the run, before its checkpoint if there is one.
+/// Copies of the directory simulate a kill in every iteration of the run, before the iteration's checkpoint if it
+/// writes one.
 #[test]
 fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
     let ((_one, one), (_two, two)) = (servers_of(1), servers_of(2));
@@ -223,7 +225,7 @@ fn a_run_goes_on_from_any_iteration_to_the_same_bytes() {
             let killed = kills.path().join(iteration.to_string());
             let servers = if iteration.is_multiple_of(2) { &one } else { &two };
             if killed.join("done").exists() {
-                continue; // two of them are equal
+                continue; // this copy was resumed already
             }
             let outcome = go_on(servers, &killed).unwrap_or_else(|error| panic!("{iteration}: {error}"));
             assert_eq!(outcome.progress.iterations, iterations);
@@ -243,7 +245,7 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
     let stop = StopFlag::default();
     let outcome = train(&servers, &config(text), &directory, 1, &stop, |progress| {
         if progress.iterations == 16 {
-            stop.raise(15); // with a checkpoint, but no line of progress.csv at that iteration
+            stop.raise(15); // the stop saves a checkpoint and logs a line of progress.csv that is not due
         }
     })
     .expect("a training");
@@ -255,7 +257,7 @@ fn a_run_that_was_stopped_goes_on_to_the_same_bytes() {
     assert_eq!(resumed.checkpoint, Checkpoint::load(whole.path()).expect("a checkpoint"));
 }
 
-/// The fixture is a checkpoint of format 1 that perturb 0.1.0 wrote. It was trained in CartPole of revision 0.
+/// The fixture is a checkpoint of format 1 that perturb 0.1.0 wrote. Its policy was trained in CartPole of revision 0.
 #[test]
 fn old_formats_load_and_other_revisions_are_refused() {
     let (_server, servers) = servers_of(1);
@@ -276,7 +278,7 @@ fn old_formats_load_and_other_revisions_are_refused() {
     let advice = "resume with the version of perturb-server that it began with, or train again";
     assert_eq!(error, format!("the run was {revisions}; {advice}"));
 
-    // If the document had the present revision, the checkpoint could be tested.
+    // With the present revision in its document, the checkpoint can be tested.
     edit(out.path(), "/environment_spec/revision", 1.into());
     let checkpoint = Checkpoint::load(out.path()).expect("a checkpoint");
     let tester = Tester::new(&servers, &checkpoint, options).expect("the environment is the same");
@@ -408,8 +410,8 @@ const DAMAGES: &[Damage] = &[
     ("no environments", |run| edit(run, "/config/num_envs", 0.into())),
     ("another algorithm", |run| edit(run, "/config/algorithm", "rl2-ppo".into())),
     ("no random stream of the optimiser", |run| edit(run, "/resume/algorithm/rng", Value::Null)),
-    ("a history that is none", |run| edit(run, "/resume/history", 5.into())),
-    ("nothing to go on with", |run| {
+    ("an invalid history", |run| edit(run, "/resume/history", 5.into())),
+    ("no state for resuming", |run| {
         edit(run, "/resume", Value::Null);
         Checkpoint::load(run).expect("it can be tested");
     }),
@@ -450,7 +452,7 @@ fn a_run_that_cannot_be_resumed_says_why_and_is_not_changed() {
         let mut error = go_on(&servers, out.path()).expect_err(damage);
         error = error.replace(&out.path().display().to_string(), "RUN");
         for name in names(&base.path().join("checkpoint")) {
-            // File names contain numbers of the training and a checksum, so the snapshot has only their beginnings.
+            // File names contain the number of iterations and a checksum, so the snapshot has only their beginnings.
             error = error.replace(&name, name.split_once('-').map_or(&name, |(kind, _)| kind));
         }
         // The length of the log depends on the times in it, so it is replaced, too.
@@ -467,7 +469,7 @@ fn a_run_that_cannot_be_resumed_says_why_and_is_not_changed() {
 }
 
 #[test]
-fn what_is_no_run_is_not_resumed() {
+fn other_folders_than_a_run_are_not_resumed() {
     let base = broken_off();
     let error = |name: &str| {
         let error = RunDirectory::resume(&base.path().join(name)).expect_err("no run");

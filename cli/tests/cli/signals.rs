@@ -18,7 +18,7 @@ use crate::patience::{Named, train};
 const MAX_SECONDS: f64 = 20.0;
 const SETTINGS: &str =
     "environment = 'CartPole'\nalgorithm = 'ppo'\narchitecture = 'ff'\nepisodes = 1000000\nseed = 1\n";
-/// Settings with short rollouts and updates that take minutes.
+/// Settings with rollouts that take a moment and updates that take minutes.
 const LONG_UPDATES: &str = "n_epochs = 1000\nn_steps = 2048\n";
 
 /// Sends SIGTERM, waits for the end of the program, and checks that it came within [`MAX_SECONDS`].
@@ -90,7 +90,7 @@ fn a_long_update_is_broken_off() {
     let folder = tempfile::tempdir().expect("a directory");
     let (child, out, said) = train(&folder, &format!("{SETTINGS}{LONG_UPDATES}"), &["--workers", "1"]);
     wait_for("a training", || out.join("monitor.csv").exists());
-    std::thread::sleep(Duration::from_secs(3)); // a rollout takes a moment
+    std::thread::sleep(Duration::from_secs(3)); // until the first update, after a rollout
     terminated(child);
     let said = std::fs::read_to_string(said).expect("messages");
     assert!(said.contains("stopped by signal 15 during an update"), "{said}");
@@ -115,9 +115,9 @@ fn signalled(signal: &str, prepare: impl FnOnce(&mut Command)) -> (Child, TempDi
 #[case::user_2("-USR2", 12)]
 #[case::processor_time("-XCPU", 24)]
 #[case::terminate("-TERM", 15)]
-fn every_warning_saves_a_checkpoint(#[case] signal: &str, #[case] number: i32) {
+fn every_signal_saves_a_checkpoint(#[case] signal: &str, #[case] number: i32) {
     let (child, folder) = signalled(signal, |command| {
-        // The tests may run in a shell that ignores SIGHUP, and programs inherit that. This program does not ignore it.
+        // The tests may run in a shell that ignores SIGHUP, which programs inherit. `env` ends that for this program.
         let program = command.get_program().to_owned();
         let arguments: Vec<_> = command.get_args().map(ToOwned::to_owned).collect();
         *command = Command::new("env");
@@ -125,7 +125,8 @@ fn every_warning_saves_a_checkpoint(#[case] signal: &str, #[case] number: i32) {
         command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::piped());
     });
     if number != 15 {
-        let _ = Command::new("kill").args([signal, &child.id().to_string()]).status(); // terminals and kernels repeat them
+        // Terminals and kernels may repeat these signals. A second SIGTERM would end the program immediately.
+        let _ = Command::new("kill").args([signal, &child.id().to_string()]).status();
     }
     let output = ended(child);
     assert_eq!(output.status.code(), Some(128 + number), "{}", stderr(&output));

@@ -49,7 +49,7 @@ fn a_briefly_silent_server_is_waited_for(#[case] text: &str, #[case] names: &[&s
     assert_eq!(result(&out), undisturbed(text), "after {stops} stops");
 }
 
-/// The client connects over TCP, because sessions over Unix sockets have no leases.
+/// The client connects over TCP to a proxy, because clients request no lease over a Unix socket.
 #[test]
 fn a_session_resumes_when_a_silent_server_answers_again() {
     let folder = tempfile::tempdir().expect("a directory");

@@ -68,7 +68,7 @@ impl Place {
         String::from_utf8(output.stdout).expect("text")
     }
 
-    /// Returns the messages of a command that ends with status 2 before it begins.
+    /// Runs a command that must be refused with exit status 2, and returns its messages.
     #[track_caller]
     fn refused(&self, words: &[&str]) -> String {
         let output = self.run(words);
@@ -127,7 +127,7 @@ fn wrong_task_folders_are_refused_with_a_remedy() {
     let remedy = "give the folder of a task, which docs/tasks.md describes\n";
     assert_eq!(said("nowhere"), format!("perturb: --task nowhere does not exist: {remedy}"));
     assert_eq!(said("empty"), format!("perturb: --task empty has no file task.toml: {remedy}"));
-    assert_eq!(said("arm/arm.xml"), format!("perturb: --task arm/arm.xml is no folder: {remedy}"));
+    assert_eq!(said("arm/arm.xml"), format!("perturb: --task arm/arm.xml is not a folder: {remedy}"));
     let both = place.refused(&["envs", "--task", "arm", "--server", "unix:/nowhere"]);
     let expected = "--task is for a private server; give it to perturb-server instead";
     assert_eq!(both, format!("perturb: {expected}\n"));
@@ -137,7 +137,7 @@ fn wrong_task_folders_are_refused_with_a_remedy() {
     assert!(said.contains("perturb-server: --task arm: task.toml, line 6: unknown key \"steps_limit\""), "{said}");
     assert!(said.contains("perturb: perturb-server refused a task of arm, for the reason above; "), "{said}");
     let unknown = refusal(&["train", "--env", "Robot"], &[]);
-    assert!(unknown.contains("; a task of a folder needs --task DIR, here or at the server\n"));
+    assert!(unknown.contains("; an environment of a task folder needs --task DIR, of this command or of the server\n"));
     assert!(!place.path("runs").exists(), "nothing was begun");
 }
 

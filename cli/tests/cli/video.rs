@@ -312,7 +312,7 @@ fn an_mp4_without_ffmpeg_is_refused_at_the_start() {
     let output = command.env("PATH", "/nowhere").output().expect("perturb");
     assert_eq!(output.status.code(), Some(2));
     let words = stderr(&output);
-    assert!(words.contains("apt-get install ffmpeg") && words.contains(".gif, which needs nothing"), "{words}");
+    assert!(words.contains("apt-get install ffmpeg") && words.contains("a .gif, which needs no other"), "{words}");
     assert!(names(&folder).is_empty());
     let gif = folder.path().join("a.gif");
     let mut command = video(&out, &gif, &["--server", &server.address().to_string(), "--episodes", "1"]);
@@ -394,8 +394,8 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
         command.args(["--server", address]);
     }
     let child = command.spawn().expect("perturb");
-    // A GIF is written only at its end, so processor time shows that frames are made. Starting takes less time than
-    // this.
+    // A GIF is written only at its end, so processor time shows that frames are made. Starting `perturb` takes less
+    // than this half second.
     wait_for("the first frames", || processor_seconds(child.id()) > 0.5);
     end(child.id());
     (ended(child), names(&folder))

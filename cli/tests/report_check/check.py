@@ -63,7 +63,7 @@ LOOK = """
 })()
 """
 
-# JavaScript for the names of figures whose links do not lead to the shown picture and to its numbers.
+# JavaScript that returns the names of figures whose links do not lead to the shown picture and to its numbers.
 FILES = """
 [...document.querySelectorAll('figure:not(.missing)')].filter(figure => {
   const content = kind => {
@@ -124,7 +124,7 @@ PRINTED = """
 
 
 class Browser:
-    """Chromium with one page, which can reach only the host `reachable`."""
+    """Chromium with one page. It can reach only the host `reachable`, or no host if that is empty."""
 
     def __init__(self, program, profile, reachable=""):
         to_browser, self.requests = os.pipe()
@@ -302,13 +302,13 @@ def main():
         pdf = browser.call("Page.printToPDF", preferCSSPageSize=True, printBackground=False)
         (screenshots / "print.pdf").write_bytes(base64.b64decode(pdf["data"]))
         said = {"Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"}
-        check("said on the console", [event for event in browser.events if event["method"] in said], [])
+        check("console messages", [event for event in browser.events if event["method"] in said], [])
         asked = {
             event["params"]["request"]["url"]
             for event in browser.events
             if event["method"] == "Network.requestWillBeSent"
         }
-        check("asked for", {address for address in asked if not address.startswith("data:")}, {url})
+        check("requested URLs", {address for address in asked if not address.startswith("data:")}, {url})
         browser.end()
 
     if wrong:

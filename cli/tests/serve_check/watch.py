@@ -29,14 +29,14 @@ WIDTHS = {1280: 900, 400: 800}
 LIMIT = 300  # upper bound of every wait, s; it is long because the machine may be busy
 WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 LIVE = "document.getElementById('live').dataset.state === 'live'"
-# JavaScript for the last episode number of the learning curve.
+# JavaScript that returns the last x value of the learning curve, an episode or a step.
 REACH = "Number(document.querySelector('[data-chart=return]').dataset.reach ?? 0)"
 DONE = "document.querySelectorAll('.map li.done').length"
 REPORTED = "document.querySelector('iframe.report').contentDocument?.body.innerText.includes('WORDS') ?? false"
-# The possible colours of the lines in each plot. Lines of the plot `cells` have the colour of the cell's kind.
+# The possible colours of the lines in each plot. A plot of several runs has the colours of `cells`, one for each kind.
 LINES = {"return": ["#0072b2"], "success": ["#009e73"], "length": ["#cc79a7"], "speed": ["#d55e00"]}
 LINES["cells"] = ["#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8a6d00", "#7f7f7f"]
-# JavaScript for a list with the name of each drawn plot, and its number of pixels in a colour of its lines.
+# JavaScript that returns the name of each drawn plot, with its number of pixels in a colour of its lines.
 PAINTED = """[...document.querySelectorAll('figure.chart canvas')].map(canvas => {
   const name = canvas.closest('figure').dataset.chart;
   const several = canvas.closest('figure').querySelector('.legend') !== null;
@@ -96,8 +96,10 @@ class Pages:
         self.check(f"{what}: the page was not loaded again", self.evaluate("window.since"), "the beginning")
 
     def draw(self, name, plots=(), schemes=("light", "dark")):
-        """Takes screenshots at all widths and colour schemes, and checks the layout of each. The page must have
-        exactly `plots` (unless it is None), and each plot must have a line."""
+        """Takes screenshots at all widths and colour schemes, and checks the layout of each.
+
+        The page must have exactly the plots in `plots`, unless `plots` is None. Each plot must have a line.
+        """
         for scheme in schemes:
             self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
             for width, height in WIDTHS.items():
@@ -114,7 +116,7 @@ class Pages:
                     self.check(f"{name}: plots at {width}", [plot for plot, _ in painted], list(plots))
                 bare = [(plot, count) for plot, count in painted if count < LEAST_LINE]
                 self.check(f"{name}: plots without a line at {width}, with the pixels that have its colour", bare, [])
-        self.check(f"{name}: without a name", self.evaluate(UNNAMED), 0)
+        self.check(f"{name}: elements without an accessible name", self.evaluate(UNNAMED), 0)
         self.check(f"{name}: pictures that do not load", self.evaluate(BROKEN), [])
         first, last = schemes[0], next(iter(WIDTHS))
         self.browser.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": first}])
@@ -188,7 +190,7 @@ def main():
         server.send_signal(signal.SIGINT)
         if (status := server.wait(timeout=LIMIT)) != 130 or time.monotonic() - begun > 5:
             wrong.append(f"Ctrl-C ended the server with {status} after {time.monotonic() - begun:.1f} s, expected 130 at once")
-        if not pages.until("the word that it is lost", "document.getElementById('live').innerText.includes('lost')"):
+        if not pages.until("a notice that it is lost", "document.getElementById('live').innerText.includes('lost')"):
             wrong.append(pages.wrong[-1])
         if training.poll() is not None:
             wrong.append("the training ended before the pages were looked at")
@@ -241,7 +243,7 @@ def watch_experiment(pages, experiment):
     pages.evaluate("window.kept = document.querySelector('.map a'); window.kept.focus()")
     done = pages.evaluate(DONE)
     pages.until("a cell that is done", f"{DONE} > {done}")
-    pages.check("what has the focus keeps it", pages.evaluate("document.activeElement === window.kept"), True)
+    pages.check("the focused element keeps the focus", pages.evaluate("document.activeElement === window.kept"), True)
     pages.draw("experiment-later", None)
     if status := experiment.wait(timeout=LIMIT):
         pages.wrong.append(f"perturb run ended with {status}")

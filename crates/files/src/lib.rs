@@ -226,7 +226,7 @@ pub fn require_writable(path: &Path) -> Result<()> {
     }
     if !folder.is_dir() {
         let (kind, words) = match folder.exists() {
-            true => (ErrorKind::NotADirectory, format!("{} is no folder", folder.display())),
+            true => (ErrorKind::NotADirectory, format!("{} is not a folder", folder.display())),
             false => {
                 let command = format!("mkdir -p {}", quoted(folder));
                 (ErrorKind::NotFound, format!("there is no folder {}; make it with `{command}`", folder.display()))
@@ -311,7 +311,7 @@ mod tests {
         for (name, words) in [
             ("", "it is a folder"),
             ("no/file", "mkdir -p "),
-            ("file/file", "is no folder"),
+            ("file/file", "is not a folder"),
             (&long, "File name too long"),
         ] {
             let error = require_writable(&path(name)).unwrap_err().to_string();

@@ -39,7 +39,7 @@ pub struct Distribution(Vec<Interval>);
 
 /// The error for intervals or a text that are not a distribution.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{got} is no set of values; expected {expected}")]
+#[error("{got} is not a set of values; expected {expected}")]
 pub struct DistributionError {
     /// The wrong intervals or text.
     pub got: String,
@@ -346,6 +346,6 @@ mod tests {
             let error = text.parse::<Distribution>().unwrap_err().to_string();
             assert!(error.contains("expected"), "{text}: {error}");
         }
-        assert!("x..1".parse::<Distribution>().unwrap_err().to_string().starts_with("`x..1` is no set of values"));
+        assert!("x..1".parse::<Distribution>().unwrap_err().to_string().starts_with("`x..1` is not a set of values"));
     }
 }

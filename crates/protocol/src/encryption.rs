@@ -74,12 +74,12 @@ impl Connector {
         let mut config = match credentials.identity {
             Some((chain, key)) => builder
                 .with_client_auth_cert(chain, key)
-                .map_err(|error| format!("{CERT} and {KEY} do not go together: {error}"))?,
+                .map_err(|error| format!("{CERT} and {KEY} do not match: {error}"))?,
             None => builder.with_no_client_auth(),
         };
         config.alpn_protocols = vec![b"h2".to_vec()];
-        let name =
-            ServerName::try_from(name.to_owned()).map_err(|_| format!("`{name}` can be no certificate's name"))?;
+        let name = ServerName::try_from(name.to_owned())
+            .map_err(|_| format!("`{name}` cannot be the name of a certificate"))?;
         let host = host.to_owned();
         let failure = Arc::default();
         Ok(Self { host, port, name, config: Arc::new(config), shows_certificate, failure })

@@ -24,7 +24,7 @@ pub enum ClientError {
     Connect { address: Address, reason: String },
     /// Another program than perturb-server answers at the address.
     #[error(
-        "what answers at {address} is no perturb-server: correct --server, or start one at a free port with \
+        "the program at {address} is not a perturb-server: correct --server, or start one at a free port with \
          `perturb-server --listen tcp://127.0.0.1:0`"
     )]
     NotPerturb { address: Address },
@@ -117,7 +117,7 @@ impl ClientError {
         match self {
             Self::Connect { address, reason } => format!("{address}: {reason}"),
             Self::Unsafe { address, reason } => format!("{address}: {reason}"),
-            Self::NotPerturb { address } => format!("{address}: what answers there is no perturb-server"),
+            Self::NotPerturb { address } => format!("{address}: the program there is not a perturb-server"),
             other => other.to_string(),
         }
     }

@@ -161,7 +161,7 @@ pub enum Error {
         source: io::Error,
     },
     /// A line is not valid, or does not match the lines before it.
-    #[error("line {line} of {path} {what}: the file was changed after it was written, or is no ledger")]
+    #[error("line {line} of {path} {what}: the file was changed after it was written, or is not a ledger")]
     Broken {
         /// The path of the ledger's file.
         path: PathBuf,

@@ -322,7 +322,7 @@ fn read_lines(output: ChildStdout) -> std::io::Result<Receiver<String>> {
 fn find_program() -> Result<PathBuf, ClientError> {
     if let Some(path) = std::env::var_os(VARIABLE) {
         let path = PathBuf::from(path);
-        let tried = format!("{VARIABLE} names {}, which is no file", path.display());
+        let tried = format!("{VARIABLE} names {}, which is not a file", path.display());
         return if path.is_file() { Ok(path) } else { Err(ClientError::NoServerProgram { tried }) };
     }
     let executable = std::env::current_exe().ok();

@@ -182,7 +182,8 @@ impl ExternalEvaluation {
             return Err(ExternalEvaluationError::Mixed { got });
         }
         if trained.len() != policies.len() {
-            return Err(ExternalEvaluationError::Mixed { got: "two were trained on the same one".into() });
+            let got = "two have the same training distribution or an unknown one".into();
+            return Err(ExternalEvaluationError::Mixed { got });
         }
         Ok(Self { name, agent, policies })
     }

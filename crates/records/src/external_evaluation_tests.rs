@@ -81,7 +81,7 @@ fn policies_of_an_agent_differ_in_training_distribution() {
     let one = |name: &str, trained_on| fixture::assessed("PPO", name, &[trained_on], [200; 3]).policies;
     for (policies, words) in [
         ([one("CartPole", Some(D)), one("Pendulum", Some(R))].concat(), "they are of CartPole and Pendulum"),
-        ([one("CartPole", None), one("CartPole", None)].concat(), "trained on the same"),
+        ([one("CartPole", None), one("CartPole", None)].concat(), "two have the same training distribution"),
     ] {
         let refused = ExternalEvaluation::new(String::new(), "PPO".into(), policies).unwrap_err().to_string();
         assert!(refused.contains(words), "{refused}");

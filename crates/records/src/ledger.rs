@@ -1,6 +1,6 @@
-//! Audit of a policy by the servers' ledgers. A ledger records from which parameter distributions each session drew its
-//! environments, with their seeds and indices. The audit checks that the training drew from the claimed distribution,
-//! and that it never drew from the policy's test sets.
+//! Audit of a policy by the servers' ledgers. A ledger records from which distributions each session drew the
+//! parameters of its environments, with the environments' seeds and indices. The audit checks that the training drew
+//! from the claimed distribution, and that it never drew from the policy's test sets.
 //!
 //! The audit first finds the training by its seed, and the access tokens of its sessions. The owners of these tokens
 //! may have learned from all parameters that were drawn with these tokens, in any session, before the training ended.
@@ -29,7 +29,7 @@ pub struct Ledgers {
     refused: Vec<Refused>,
     /// The end of each server process; `None` if it is unknown.
     process_ends: Vec<Option<Moment>>,
-    /// The index of the first contradictory line, and a description of the contradiction.
+    /// The index of a contradictory line, the last one if there are several, and a description of the contradiction.
     defect: Option<(u64, &'static str)>,
 }
 
@@ -76,7 +76,9 @@ pub struct Proof {
     pub refused: Vec<String>,
 }
 
-/// Identifies a session: the index of the server process in the ledgers, and the session's number in this process.
+/// Identifies a session by two numbers: the index of its server process in [`Ledgers::process_ends`], and the session's
+/// number in the ledger. The session's number alone is not enough, because every server process numbers its sessions
+/// anew.
 type SessionId = (usize, u64);
 
 /// The position of a ledger's line, and the session that caused it.
@@ -180,8 +182,8 @@ impl Ledgers {
             self.defect = Some((n, "does not say that a server began"));
             return;
         }
-        let beginning = self.process_ends.len().saturating_sub(1);
-        let line = |who: LedgerSession| LedgerLine { at, session: (beginning, who.session), who };
+        let process = self.process_ends.len().saturating_sub(1);
+        let line = |who: LedgerSession| LedgerLine { at, session: (process, who.session), who };
         match event {
             LedgerEvent::Began { .. } => {
                 // A server process started. The process that wrote to the same ledger before must have ended by now.
@@ -205,7 +207,7 @@ impl Ledgers {
     fn take_draws(&mut self, line: LedgerLine, DrawRecord { regions, begins, ends, .. }: DrawRecord) {
         let named = begins.iter().map(|begin| begin.count).chain(ends.iter().map(|end| end.count));
         if named.fold(0, u32::saturating_add) > MAX_ENVS {
-            self.defect = Some((line.at.n, "names more environments than a session has"));
+            self.defect = Some((line.at.n, "names more environments than a session can have"));
             return;
         }
         for DrawEnd { seed, index, count, episode } in ends {
@@ -273,7 +275,8 @@ impl Ledgers {
                 && drawn.region.is_within([&claimed])
                 && claimed.is_within([&*drawn.region])
         };
-        // Finds the draws of the training, its sessions and its tokens, and compares the number of episodes.
+        // Finds the draws of the training, its sessions and its tokens. Compares the number of drawn episodes with
+        // `episodes`.
         let own: Vec<&Drawn> = self.drawn.iter().filter(is_own).collect();
         let sessions: BTreeSet<SessionId> = own.iter().map(|drawn| drawn.line.session).collect();
         let tokens = own.iter().map(|drawn| drawn.line.who.token.clone()).collect();

@@ -90,7 +90,7 @@ fn says(proof: &Proof, part: &str) {
 }
 
 #[test]
-fn a_training_that_kept_to_its_own_is_clean() {
+fn a_training_that_drew_only_from_its_distribution_is_clean() {
     let [begun, ended] = trained();
     let neighbours = [begins(1, "bob", E, (9, 0, 9, 0)), begins(2, "bob", R, (7, 0, 9, 0))];
     let afterwards = begins(3, "ann", E, (9, 0, 1, 0));
@@ -150,7 +150,7 @@ fn sessions_on_several_servers_are_found_in_all_their_ledgers() {
 }
 
 #[test]
-fn an_end_is_that_of_what_was_open_and_of_nothing_later() {
+fn an_end_belongs_to_open_draws_and_not_to_later_ones() {
     let [begun, ended] = trained();
     // The same seed is drawn twice. The second drawing has no recorded end.
     let again = begins(1, "ann", R, (7, 0, 1, 0));

@@ -116,14 +116,14 @@ impl Rule {
     /// [`ValueError`] if neither criterion compares the threshold's quantity, or if the server did not state the
     /// criterion.
     pub fn criterion(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
-        let unknown = |expected| move || ValueError::new("the rule of success", self, expected);
+        let unknown = |missing: &'static str| {
+            let expected = format!("left out: the server does not report {missing}");
+            move || ValueError::new("the rule of success", self, expected)
+        };
         match self {
-            Self::Code => {
-                code.cloned().ok_or_else(unknown("left out: the server does not say what the paper's code asks"))
-            }
+            Self::Code => code.cloned().ok_or_else(unknown("the success rule of the paper's code")),
             Self::Text | Self::At(_) => {
-                let text =
-                    text.ok_or_else(unknown("left out: the server does not say what its success rule compares"))?;
+                let text = text.ok_or_else(unknown("the quantity of its success rule"))?;
                 let Self::At(threshold) = self else { return Ok(text.clone()) };
                 let other = code.filter(|code| code.quantity == threshold.quantity && text.quantity != code.quantity);
                 other.unwrap_or(text).with(threshold)
@@ -227,7 +227,8 @@ mod tests {
         let refused = |rule: &str| rule.parse::<Rule>().unwrap().criterion(Some(&text), None).unwrap_err().to_string();
         assert_eq!(
             refused("code"),
-            "the rule of success is code, but must be left out: the server does not say what the paper's code asks"
+            "the rule of success is code, but must be left out: the server does not report the success rule of the \
+             paper's code"
         );
         assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "nobody counts them");
         for rule in ["text", "code", "steps=90"] {

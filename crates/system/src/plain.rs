@@ -50,7 +50,7 @@ pub fn require_plain(metadata: &Metadata) -> Result<()> {
         true => Ok(()),
         false if metadata.is_dir() => Err(Error::new(ErrorKind::IsADirectory, "it is a folder, expected a file")),
         false => {
-            let words = "it is a pipe or a device, expected a plain file; write the content to a file and name that";
+            let words = "it is a pipe or a device, expected a regular file; write the content to a file and name that";
             Err(Error::new(ErrorKind::InvalidInput, words))
         }
     }

@@ -88,7 +88,7 @@ impl Servers {
             // The user gave no address, so the error does not name the address.
             Err(error) => Err(server.unusable(&match error {
                 ClientError::Connect { reason, .. } => reason,
-                ClientError::NotPerturb { .. } => "it is no perturb-server".into(),
+                ClientError::NotPerturb { .. } => "it is not a perturb-server".into(),
                 error => error.to_string(),
             })),
         }

@@ -40,8 +40,8 @@ pub enum RunDirectoryError {
     },
     /// The directory contains an earlier run, and `overwrite` is off.
     #[error(
-        "{path} already holds a run ({file}): choose another --out, give --overwrite to delete that run, or go on with \
-         it: perturb train --resume {}",
+        "{path} already holds a run ({file}): choose another --out, give --overwrite to delete that run, or resume it \
+         with: perturb train --resume {}",
         quoted(path),
         path = path.display()
     )]

@@ -46,7 +46,7 @@ fn catalogue_with(_: TaskFolderTuple) -> PyResult<Catalogue> {
     Err(failure(INVALID, 0, "this package was built without MuJoCo, which task= needs here: leave server= out"))
 }
 
-/// The embedded server as a Python class. Its sessions end when it is closed.
+/// The embedded server as a Python class.
 #[pyclass(frozen, module = "perturb._native")]
 pub struct NativeServer {
     /// `None` after [`close`](Self::close).
@@ -69,7 +69,8 @@ impl NativeServer {
         Ok(Self { server: Mutex::new(Some(Arc::new(server))), owner: std::process::id() })
     }
 
-    /// Ends the server's threads. The caller must close all sessions of the server first.
+    /// Ends the server's threads. The caller must close all sessions of the server first, because an open session keeps
+    /// the threads running.
     fn close(&self, py: Python<'_>) {
         if std::process::id() == self.owner {
             let server = self.server.lock().unwrap_or_else(PoisonError::into_inner).take();
@@ -106,7 +107,8 @@ pub struct EmbeddedStream {
     /// `None` while a step is running.
     session: Option<server::EmbeddedSession>,
     running: Option<StepUnderWay>,
-    /// A function that queues one step in the pool, behind the running step. `None` after the function was called.
+    /// A function that queues one step in the pool, behind the running step. `None` if no step is running, if the next
+    /// step must wait, or after the function was called.
     offer: Option<Box<dyn FnOnce(SessionRequest) + Send>>,
     /// Steps that wait until the running one has finished.
     waiting: VecDeque<SessionRequest>,
@@ -134,7 +136,7 @@ impl EmbeddedStream {
         })
     }
 
-    /// Sends a request and waits for its reply. `None` sends nothing and waits for the reply to the oldest step that
+    /// Sends a request and waits for its reply. `None` sends nothing, and waits for the oldest reply to a step that
     /// [`send`](Self::send) sent.
     ///
     /// # Errors
@@ -146,7 +148,7 @@ impl EmbeddedStream {
         }
     }
 
-    /// Sends a request and waits for its reply. All earlier steps must have been received.
+    /// Sends a request and waits for its reply. The replies to all earlier steps must have been received.
     ///
     /// # Errors
     /// [`RequestFailure`].
@@ -169,7 +171,7 @@ impl EmbeddedStream {
         self.advance();
     }
 
-    /// Waits for the reply to the oldest step that was sent and not received.
+    /// Waits for the oldest reply to a step that was sent.
     ///
     /// # Errors
     /// [`RequestFailure`].
@@ -234,7 +236,8 @@ fn defect() -> RequestFailure {
     RequestFailure::Ended(failure(MISMATCH, 0, "no session: a defect of the native module"))
 }
 
-/// Polls a future once, and returns its output if it is ready. The caller needs no async runtime.
+/// Polls a future once, and returns its output if it is ready. Works outside an async runtime, unless the future itself
+/// needs one.
 pub fn poll_once<T>(future: Pin<&mut (dyn Future<Output = T> + Send + '_)>) -> Option<T> {
     match future.poll(&mut Context::from_waker(Waker::noop())) {
         Poll::Ready(output) => Some(output),

@@ -22,11 +22,12 @@ pub const LOST: &str = "lost";
 pub const TIMED_OUT: &str = "timed out";
 /// Kind of failure: the server sent the reply to another kind of request.
 pub const MISMATCH: &str = "mismatch";
-/// Kind of failure: the arrays of a reply have a wrong length.
+/// Kind of failure: a reply has invalid content, such as an array of a wrong length.
 pub const MALFORMED: &str = "malformed";
 /// Kind of failure: an argument is invalid.
 pub const INVALID: &str = "invalid";
-/// Kind of failure: the session has ended, belongs to another process, or is in use by another thread.
+/// Kind of failure: an object does not permit the call in its present state. For example, a session has ended, belongs
+/// to another process, or is in use by another thread.
 pub const UNUSABLE: &str = "unusable";
 /// Kind of failure: a policy cannot be loaded, does not fit the environment, or cannot act.
 pub const POLICY: &str = "policy";
@@ -71,7 +72,7 @@ pub fn from_client(error: &ClientError) -> PyErr {
         ClientError::Protocol { got, .. } => failure(MISMATCH, 0, got),
         ClientError::Connect { reason, .. } => failure(UNREACHABLE, 0, reason),
         ClientError::Unsafe { reason, .. } => failure(UNREACHABLE, UNAUTHENTICATED, reason),
-        ClientError::NotPerturb { .. } => failure(UNREACHABLE, 0, "what answers there is no perturb-server"),
+        ClientError::NotPerturb { .. } => failure(UNREACHABLE, 0, "the program there is not a perturb-server"),
         other => failure(UNREACHABLE, 0, other.to_string()),
     }
 }

@@ -10,9 +10,9 @@
 //!   text;
 //! - `context_id`: the trial's index, which counts the draws of parameters.
 //!
-//! The info of an episode's last step has the same keys for this episode. It also has `is_success`, `diverged` and
-//! `achieved`, the value of the quantity that the success rule compares (NaN if the episode has none). With reward
-//! terms, the info of every step has `reward_terms`. No value depends on the clock.
+//! With receipts, the info of an episode's last step has the same keys for this episode. With or without receipts, it
+//! has `is_success`, `diverged` and `achieved`, the value of the quantity that the success rule compares (NaN if the
+//! episode has none). With reward terms, the info of every step has `reward_terms`. No value depends on the clock.
 //!
 //! In the infos of a batch, each key has an array `[N]` of values. The key with an underscore before it has a mask
 //! `[N]` of the environments that have a value, as Gymnasium's `VectorEnv._add_info` makes it.
@@ -228,8 +228,9 @@ impl Events {
     }
 
     /// Returns the infos of a batch. `moved`, bool `[N]`, is the mask of environments that took a step; `None` means
-    /// all. `same_step` is true if an ended episode and the reset after it are in one step. The key `final_info` then
-    /// has the infos of the episodes that ended, and the other keys have the infos of the episodes that began.
+    /// all. `same_step` is true if environments reset in the same step in which an episode ends. The key `final_info`
+    /// then has the infos of the episodes that ended. The other keys have the receipts of the episodes that began, and
+    /// the reward terms of the environments whose episodes continue.
     #[pyo3(signature = (moved, same_step))]
     fn batch<'py>(
         &self,

@@ -1,6 +1,6 @@
 //! The Python package's native module, `perturb._native`: sessions of the protocol, as Python objects and NumPy arrays.
 //!
-//! - [`session`]: a session, which releases Python's lock while it waits, handles signals, and survives forks.
+//! - [`session`]: a session, which releases the GIL while it waits, handles signals, and survives forks of its process.
 //! - [`embedded`]: the server in this process, and its sessions.
 //! - [`session_runtime`]: the async runtime of a session's connection, driven by the waiting thread.
 //! - [`requests`]: conversion of Python's values to requests.

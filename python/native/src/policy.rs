@@ -21,7 +21,8 @@ pub struct PythonPolicy {
 
 #[pymethods]
 impl PythonPolicy {
-    /// Loads the checkpoint in a folder, or in the folder `checkpoint` below it.
+    /// Loads a policy from a policy file, from the folder of a checkpoint, or from the folder above `checkpoint`. Also
+    /// accepts the id of an experiment's cell; see [`Checkpoint::load`].
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
         let checkpoint = Checkpoint::load(&path).map_err(|error| refused(&error))?;
@@ -150,12 +151,12 @@ struct Playing {
 impl PythonPlayer {
     /// Begins the first trial in every environment, with observations `[N, O]`.
     fn begin(&self, observations: PyReadonlyArray2<'_, f32>) -> PyResult<()> {
-        self.own()?.begin(&observations)
+        self.lock()?.begin(&observations)
     }
 
     /// Samples the next actions: int64 `[N]`, or float32 `[N, A]`.
     fn act<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
-        self.own()?.act(py)
+        self.lock()?.act(py)
     }
 
     /// Records the outcome of the last actions: observations `[N, O]`, rewards `[N]`, and `starts` `[N]`. `starts` is
@@ -166,12 +167,12 @@ impl PythonPlayer {
         rewards: PyReadonlyArray1<'_, f32>,
         starts: PyReadonlyArray1<'_, bool>,
     ) -> PyResult<()> {
-        self.own()?.observe(&observations, &rewards, &starts)
+        self.lock()?.observe(&observations, &rewards, &starts)
     }
 }
 
 impl PythonPlayer {
-    fn own(&self) -> PyResult<MutexGuard<'_, Playing>> {
+    fn lock(&self) -> PyResult<MutexGuard<'_, Playing>> {
         match self.0.try_lock() {
             Ok(playing) => Ok(playing),
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
@@ -187,7 +188,8 @@ impl Playing {
         let observations = self.rows(observations)?;
         self.trials.fill((0, 0));
         self.player.begin(&observations, None).map_err(|error| refused(&error))?;
-        // After an earlier use of this player, its random streams may be those of later trials. Go back to the first.
+        // After an earlier use of this player, its random streams may be those of later trials. Go back to the streams
+        // of the first trial.
         (0..self.trials.len()).for_each(|slot| self.player.begin_trial(slot, self.seed, 0));
         Ok(())
     }

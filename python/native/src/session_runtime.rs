@@ -77,8 +77,8 @@ impl Reactor {
 
     /// Returns a new runtime, or the one with the fewest sessions if there are [`MAX_RUNTIMES`].
     fn find() -> io::Result<Arc<Self>> {
-        // In a forked process, nobody may ever release the lock, because the fork did not copy the thread that holds
-        // the lock. Do not wait for it: make a separate runtime.
+        // Do not wait for the lock, but make a separate runtime. In a forked process the lock may stay held for ever,
+        // because the fork did not copy the thread that held it.
         let Ok(mut reactors) = REACTORS.try_lock() else { return Self::new() };
         let own = std::process::id();
         let used: Vec<_> = reactors.iter().filter_map(Weak::upgrade).filter(|reactor| reactor.owner == own).collect();
@@ -120,7 +120,7 @@ impl SessionRuntime {
         Ok(Self { reactor: Reactor::find()? })
     }
 
-    /// Waits for a future until the deadline. Python's lock is released during the wait, except for signal checks.
+    /// Waits for a future until the deadline. The GIL is released during the wait, except for signal checks.
     ///
     /// # Errors
     /// [`WaitError`] if the wait ended before the future was ready.
@@ -158,8 +158,8 @@ impl SessionRuntime {
         }
     }
 
-    /// Calls a function on this thread without Python's lock. The function must not block. It runs in the context of
-    /// the runtime, so it may spawn tasks.
+    /// Calls a function on this thread without the GIL. The function must not block. It runs in the context of the
+    /// runtime, so it may spawn tasks.
     pub fn now<T: Send>(&self, py: Python<'_>, work: impl FnOnce() -> T + Send) -> T {
         py.detach(|| {
             let _context = self.reactor.runtime.as_ref().map(Runtime::enter);
@@ -167,8 +167,8 @@ impl SessionRuntime {
         })
     }
 
-    /// Lets the connection write pending messages and answer the server's keepalive pings. The caller must not hold
-    /// Python's lock.
+    /// Lets the connection write pending messages and answer the server's keepalive pings. The caller must not hold the
+    /// GIL.
     pub fn poll_io(&self) {
         if let Some(runtime) = &self.reactor.runtime {
             runtime.block_on(async {

@@ -106,9 +106,10 @@ class Assessment:
     def success_by_parameter(self, scenario: str, parameter: str) -> tuple[Bin, ...]:
         """Return the success rate of a scenario in each bin of a parameter's range.
 
-        The range of the parameter's values is divided into ten bins of equal width. Bin edges are in the parameter's
-        unit. A tenth of the range that holds no values, such as the gap between E's two intervals, has no bin. The
-        result is empty if the parameter does not vary in this scenario.
+        The range of the parameter's values is divided into about ten equal bins. Bin edges are in the parameter's unit.
+        If two neighbouring values differ by a tenth of the range or more, no bin covers the gap between them, such as
+        the gap between E's two intervals. The points of a coarse grid thus have one bin each, of width 0. The result is
+        empty if the parameter does not vary in this scenario.
 
         Raises:
             UnknownNameError: if the scenario was not tested.
@@ -268,9 +269,9 @@ class Assessment:
     def columns(self) -> dict[str, Any]:
         """Return all recorded episodes as columns: arrays [episodes] by column name.
 
-        The first column, `trained_on`, is the version that the policy was trained on. The others are the columns of
-        `perturb evaluate --records`. `trained_on`, `set`, `model_hash` and `ending` are arrays of text. `achieved` is
-        NaN where an episode has no value of the quantity that the success rule compares.
+        The first column, `trained_on`, is the version that the policy was trained on; empty if unknown. The others are
+        the columns of `perturb evaluate --records`. `trained_on`, `set`, `model_hash` and `ending` are arrays of text.
+        `achieved` is NaN where an episode has no value of the quantity that the success rule compares.
         """
         tables = [(one.trained_on, one.records.columns()) for one in self._assessed]
         names = list(tables[0][1])

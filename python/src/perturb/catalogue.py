@@ -1,8 +1,8 @@
 """Descriptions of the built-in environments, read from the file catalogue.json.
 
-They make it possible to construct an environment without a server, also before a fork. The build of the package
-requested the descriptions from a server and wrote them to catalogue.json. When a session opens, its environment's
-description is compared with the server's. A difference is an error.
+With them, an environment can be constructed without a server, for example in a process that is forked later. The build
+of the package writes the output of `perturb-server --catalogue` to catalogue.json. When a session opens, its
+environment's description is compared with the server's. A difference is an error.
 """
 
 from __future__ import annotations
@@ -200,7 +200,7 @@ def _box(ranges: tuple[Range, ...]) -> spaces.Box:
 _WRITTEN: Mapping[str, Any] = json.loads(resources.files(__package__).joinpath("catalogue.json").read_text("utf-8"))
 _LIMITS: Mapping[str, Any] = _WRITTEN["limits"]
 
-# The environments' descriptions as the server prints them in JSON, as dictionaries.
+# The environments' descriptions as dictionaries, in the JSON format of `perturb-server --catalogue`.
 CATALOGUE_ENTRIES: tuple[Mapping[str, Any], ...] = tuple(_WRITTEN["environments"])
 CATALOGUE: dict[str, Description] = {
     description.name: description for description in map(Description.read, CATALOGUE_ENTRIES)

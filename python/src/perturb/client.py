@@ -234,7 +234,10 @@ class Client:
             self._own_parameters[slot] = {**self._own_parameters[slot], **parameters}
 
     def last_ended(self) -> NDArray[np.bool_]:
-        """Return a mask [N] of the environments whose episode ended in the last step and that were not reset since."""
+        """Return a mask [N] of the environments whose episode ended in the last step.
+
+        Environments that were reset or restored since are left out.
+        """
         if self._session is None or not self._session.usable():
             return np.zeros(self.num_envs, np.bool_)
         return self._session.last_ended()

@@ -90,7 +90,8 @@ def compare(
             Rows have numbers of successes but no episodes, so only success rates have an interval over episodes.
         environment: as in `evaluate`. Leave it out if all policies are assessments or rows.
         versions: as in `evaluate`. For assessments and rows, the tests to compare, by default all tests that they have
-            in common. For rows, a set may be given by its name.
+            in common. For rows, a set may be given by its name. For rows of several studies, the default includes only
+            versions, because two studies may give the same name to different sets.
         episodes: as in `evaluate`. By default the number of the first assessment, or 1000 without assessments.
         seed: seed of all tests. By default the seed of the first assessment, or 1 without assessments.
         parameters: as in `evaluate`.

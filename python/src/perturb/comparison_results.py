@@ -24,11 +24,12 @@ class ConditionMean:
     # The 95 % t interval over policies. It estimates what other training seeds would give. None with fewer than three
     # policies.
     seeds_interval: Interval | None
-    # The number of episodes of each policy.
+    # The number of episodes of each policy; the smallest number if the numbers differ.
     episodes: int
     # The 95 % interval over episodes. It estimates what the same policies would give in other episodes. For returns and
-    # lengths it is a t interval. For success rates it is a Wilson interval. All policies play the same episodes, so its
-    # number of episodes is an effective number, which accounts for their correlation.
+    # lengths it is a t interval. For success rates it is a Wilson interval with an effective number of episodes,
+    # because the results of policies in the same episodes are correlated. None for returns and lengths of rows of a
+    # results table.
     episodes_interval: Interval | None
 
     @property

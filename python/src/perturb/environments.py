@@ -89,8 +89,8 @@ class Environment:
 def environments(*, task: str | os.PathLike[str] | None = None) -> dict[str, Environment]:
     """Return the environments of this package's catalogue, by name.
 
-    The catalogue was read from a server when the package was built. When a session opens, its environment is compared
-    with the server's.
+    The catalogue is that of the perturb-server with which the package was built. When a session opens, its environment
+    is compared with the server's.
 
     Args:
         task: the folder of a task, whose environment is added at the end; see docs/tasks.md.

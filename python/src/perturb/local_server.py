@@ -129,7 +129,8 @@ class LocalServer:
 
     def end(self) -> None:
         """End the server and wait until it has ended. The caller must close all sessions of the server first."""
-        # Call the function `_end` directly. The finalizer would do nothing while Python exits and `_at_exit` runs.
+        # Call the function `_end` directly. A call of the finalizer would do nothing while Python exits, which is when
+        # `_at_exit` calls this method.
         if self._unended.detach() is not None:
             _end(self.process, self._directory, self._owner)
 

@@ -116,7 +116,8 @@ def _has_memory(function: Callable[..., Any]) -> bool:
     """Whether a function has memory. A function with memory requires three arguments.
 
     Raises:
-        PolicyError: if the function requires another number of arguments than one or three.
+        PolicyError: if the function requires two arguments, more than three, or keyword arguments; or if it takes no
+            argument.
     """
     try:
         parameters = inspect.signature(function).parameters.values()

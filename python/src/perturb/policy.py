@@ -23,11 +23,15 @@ MAX_ENVIRONMENTS = 1 << 20
 
 
 def load_policy(path: str | os.PathLike[str]) -> Policy:
-    """Load a policy that `perturb train` wrote, from the `--out` folder of the training or its checkpoint folder.
+    """Load a policy that perturb's learner trained.
+
+    `path` is the `--out` folder of the training, its checkpoint folder, or a policy file (`.safetensors`). It may also
+    be the id of an experiment's cell. Cells are searched in the folder that the environment variable PERTURB_RESULTS
+    names, by default `results`.
 
     Raises:
-        PolicyError: if the folder has no checkpoint, or if the checkpoint is damaged or was written by a later version
-            of perturb. The message names the file.
+        PolicyError: if there is no checkpoint, or if the checkpoint is damaged or was written by a later version of
+            perturb. The message names the file.
     """
     if not isinstance(path, str | os.PathLike):
         raise InvalidArgumentError(f"path is {path!r}; expected the folder of a training")

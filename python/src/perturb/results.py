@@ -44,7 +44,7 @@ class PolicyRecords:
 
     @property
     def trained_on(self) -> str | None:
-        """The version that the policy was trained on. None if unknown."""
+        """The version that the policy was trained on. None if unknown, or if it was trained on a custom set."""
         return self.known.trained_on
 
 
@@ -52,7 +52,7 @@ class PolicyRecords:
 class Result:
     """The statistics of one test: a policy on one test set. All intervals are 95 % confidence intervals."""
 
-    # The version that the policy was trained on. None if unknown.
+    # The version that the policy was trained on. None if unknown, or if it was trained on a custom set.
     trained_on: str | None
     # The name of the test set.
     tested_on: str
@@ -75,9 +75,10 @@ class Result:
     cvar_return: float
     # The bootstrap interval of `cvar_return`, from 1000 resamples of the episodes.
     cvar_interval: tuple[float, float]
-    # The success rate, %, in the worst tenth of contexts. Contexts are regions of the parameter space with about 40
-    # episodes each. One half of the episodes selects the worst contexts, and the other half measures the success rate.
-    # None if there are fewer than ten contexts, as on D.
+    # The success rate, %, in the worst tenth of contexts. Contexts are those of a grid or list, or regions of the
+    # parameter space with about 40 episodes each. One half of the episodes selects the worst contexts, and the other
+    # half measures the success rate. The value is the average over both assignments of the halves. None if fewer than
+    # ten contexts have at least two episodes, as on D.
     worst_contexts_percent: float | None
     # Whether the policy took the mode of its action distribution instead of sampling. None if unknown.
     deterministic: bool | None = None
@@ -86,7 +87,7 @@ class Result:
     def scenario(self) -> str:
         """The training version and the test set, such as `DR` or `D on corners`.
 
-        Only the test set if the training version is unknown.
+        Only the test set if `trained_on` is None.
         """
         if self.trained_on is None:
             return self.tested_on

@@ -64,7 +64,7 @@ def make_vec_env(
     return PerturbVecEnv(batch, seed)
 
 
-class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-baselines3 is not there for every check
+class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # type checks may run without stable-baselines3
     """N environments of one session as a stable-baselines3 VecEnv. `batch` is the session's PerturbVectorEnv.
 
     The info of an episode's last step has these keys:
@@ -216,18 +216,19 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # stable-
         return list(self.batch.render())
 
 
-class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # stable-baselines3 is not there for every check
+class CurriculumCallback(BaseCallback):  # type: ignore[misc]  # type checks may run without stable-baselines3
     """A stable-baselines3 callback that changes the physics on a schedule while a model learns.
 
         schedule = {0: {"length": "0.4..0.6"}, 50_000: {"length": "0.2..0.8"}}
         model.learn(100_000, callback=perturb.sb3.CurriculumCallback(schedule))
 
-    A change takes effect in each environment's next episode.
+    The schedule is read at the start of a training and of each rollout. A change takes effect in each environment's
+    next episode.
 
     Args:
         schedule: a mapping from numbers of steps, counted over all environments together, to the parameters that apply
-            from that number on. Or a function that gets the number of steps and returns parameters, or None for no
-            change.
+            from that number on. Instead, it may be a function that gets the number of steps, and returns parameters or
+            None for no change.
         verbose: 1 prints each change of parameters.
     """
 

@@ -92,7 +92,7 @@ class Session:
         self._owner = os.getpid()
         self._limit = timeout
         self._embedded = server == EMBEDDED
-        # Whether resets and steps may compile a model in this process, as those of a task from a folder may.
+        # Whether resets and steps may compile a model in this process. Only those of a task from a folder may.
         self._compiles = self._embedded and task is not None
         self._lost: str | None = None
         self._opened = False
@@ -197,7 +197,10 @@ class Session:
         return self._call("reset", self._native.reset, mask, seeds, parameters, states)
 
     def last_ended(self) -> NDArray[np.bool_]:
-        """Return a mask [N] of the environments whose episode ended in the last step and that were not reset since."""
+        """Return a mask [N] of the environments whose episode ended in the last step.
+
+        Environments that were reset or restored since are left out.
+        """
         return self._native.last_ended()
 
     @property
@@ -306,12 +309,12 @@ class Session:
                 f"{where} refused {kind}, which is too large for it: {words}; "
                 "start it with a larger --max-message-bytes, or use fewer environments"
             )
-        if code == UNAUTHENTICATED and what == "unreachable":  # a wrong certificate, or file that a variable names
+        if code == UNAUTHENTICATED and what == "unreachable":  # wrong certificate or credentials, or TLS not requested
             return ServerConnectionError(f"no safe connection to {where}: {words}")
         if code == UNAUTHENTICATED:
             return ServerConnectionError(f"{where} refuses this process: {words}")
         if code == UNIMPLEMENTED:
-            return ProtocolError(f"what answers at {self.address} is no perturb-server: {words}")
+            return ProtocolError(f"the program at {self.address} is not a perturb-server: {words}")
         if isinstance(self._local, LocalServer):
             with contextlib.suppress(subprocess.TimeoutExpired):
                 status = self._local.process.wait(1)
@@ -457,4 +460,5 @@ def _at_exit() -> None:
 
 os.register_at_fork(after_in_child=_native.note_fork)
 os.register_at_fork(after_in_child=_after_fork_in_child)
-atexit.register(_at_exit)  # runs before the handler of `local_server`, which was registered earlier, ends the servers
+# Python calls exit handlers in reverse order, so this one closes the sessions before `local_server` ends its servers.
+atexit.register(_at_exit)

@@ -45,7 +45,7 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
         )
     path = Path(task).absolute()
     if not (path / "task.toml").is_file():
-        wrong = "has no file task.toml" if path.is_dir() else "is no folder" if path.exists() else "does not exist"
+        wrong = "has no file task.toml" if path.is_dir() else "is not a folder" if path.exists() else "does not exist"
         raise InvalidArgumentError(
             f"task={os.fspath(task)!r}: {path} {wrong}; docs/tasks.md describes folders of tasks, and "
             "perturb.tasks.from_gymnasium writes some"

@@ -82,7 +82,8 @@ def train(
             `runs/<environment>-<algorithm>-<time>`.
         overwrite: whether to delete a training that is in the folder.
         server: the server's address, `unix:/path` or `host:port`. None starts a private server.
-        progress: whether to show the number of finished episodes on standard error. By default only on a terminal.
+        progress: whether to show the number of finished episodes on standard error. By default only on a terminal. The
+            number is shown only if `out` and `episodes` are given.
 
     Raises:
         InvalidArgumentError: if the program refuses an argument. The error has the program's message.
@@ -118,14 +119,15 @@ def train(
 def _run(command: list[str], folder: Path | None, episodes: int | None, progress: bool | None) -> None:
     """Run `perturb train` as another process until it ends.
 
-    Meanwhile, show how many of the `episodes` are finished, from the log `progress.csv` in `folder`.
+    Meanwhile, show how many of the `episodes` are finished, from the log `progress.csv` in `folder`. If `episodes` or
+    `folder` is None, show nothing.
 
     Raises:
         InvalidArgumentError: if `perturb train` refuses an argument.
         PerturbError: if the training fails.
     """
-    # The program starts the first perturb-server on PATH if no server is named. PATH begins with the folder of this
-    # package's server, so that the program starts that one.
+    # If no server is named, the program starts a perturb-server: the one in PERTURB_SERVER, else the one beside itself,
+    # else the first on PATH. PATH therefore begins with the folder of this package's server.
     environment = {**os.environ, "PATH": os.pathsep.join([str(find_server().parent), os.environ.get("PATH", "")])}
     shown = Progress(progress)
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)

@@ -235,8 +235,9 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
     def set_parameters(self, parameters: requests.Parameters, mask: NDArray[np.bool_] | None = None) -> None:
         """Change parameters of the physics from the next episode of each environment on.
 
-        The current episode of an environment keeps its parameters. At its end, the environment is reset a second time,
-        so one episode index is skipped. The change waits until there are no unreceived steps.
+        The current episode of an environment keeps its parameters. After an autoreset, the environment is reset a
+        second time with the new parameters, so one episode index is skipped. If there are unreceived steps at that
+        time, the change waits for a later episode.
 
         Args:
             parameters: values by parameter, as in the constructor. Other parameters keep their distribution.

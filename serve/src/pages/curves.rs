@@ -87,7 +87,7 @@ pub(crate) fn page(root: &Root, chosen: &[RelativePath]) -> String {
 
 /// Returns the checkbox by which a user chooses a training in the list of all runs.
 pub(super) fn choice_box(name: &str, relative: &RelativePath) -> Markup {
-    html! { input type="checkbox" name="charted" value=(relative.encode()) aria-label={ "Draw " (name) } title="Draw with others"; " " }
+    html! { input type="checkbox" name="charted" value=(relative.encode()) aria-label={ "Compare " (name) } title="Compare with other trainings"; " " }
 }
 
 /// Returns the link to the curves of the chosen trainings. It is hidden until the script adds the trainings to it.

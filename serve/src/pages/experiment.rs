@@ -32,7 +32,7 @@ pub(crate) fn update(
         Ok(status) => {
             let parts = vec![
                 ("head", head(status, experiment)),
-                ("kinds", kinds(status)),
+                ("rates", rates_table(status)),
                 ("working", working(status, experiment, relative)),
                 ("map", map(status, experiment, relative)),
                 ("failures", failures(status, experiment, relative)),
@@ -60,12 +60,12 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
         h1 { (shown_name(root, relative)) }
         (update.part("head"))
         (update.part("failures"))
-        (update.part("kinds"))
+        (update.part("rates"))
         (update.part("working"))
-        div.charts data-needs="cells" { (chart("cells", "Success while training of the cells in work, %, over the budget's episodes")) }
+        div.charts data-needs="cells" { (chart("cells", "Training success of the running cells, %, over episodes")) }
         details open { summary { "All cells" } (update.part("map")) }
         (update.part("pictures"))
-        h2 { "Report as it stands" }
+        h2 { "Current report" }
         (report_frame(relative, update))
         p.note {
             "Files: " a href={ "/file/" (relative.join("plan.toml").encode()) } { "plan.toml" }
@@ -75,9 +75,9 @@ pub(crate) fn page(root: &Root, relative: &RelativePath, update: &Update) -> Str
 }
 
 fn title(name: &str, status: &ExperimentStatus, experiment: &LiveExperiment) -> String {
-    let done = status.count(CellStatus::is_settled);
+    let settled = status.count(CellStatus::is_settled);
     let all = status.cells.len();
-    if experiment.state() == "in work" { format!("{done}/{all} · {name}") } else { format!("{name} · perturb") }
+    if experiment.state() == "in work" { format!("{settled}/{all} · {name}") } else { format!("{name} · perturb") }
 }
 
 fn head(status: &ExperimentStatus, experiment: &LiveExperiment) -> Markup {
@@ -112,20 +112,20 @@ fn head(status: &ExperimentStatus, experiment: &LiveExperiment) -> Markup {
     }
 }
 
-/// Returns a table with a row for each kind of cell, i.e. each environment, method and training set. A row has the
-/// number of finished cells, and their mean success in each test.
-fn kinds(status: &ExperimentStatus) -> Markup {
-    // Each kind of cell with its number of finished cells and its number of cells, in the order of the plan.
+/// Returns a table with a row for each combination of environment, method and training distribution. A row has the
+/// number of finished cells, and their mean success rate in each test.
+fn rates_table(status: &ExperimentStatus) -> Markup {
     let rates = status.rates();
-    let mut kinds: Vec<(String, usize, usize)> = Vec::new();
+    // The rows in the order of the plan: a description, the number of finished cells, and the number of all cells.
+    let mut rows: Vec<(String, usize, usize)> = Vec::new();
     for (cell, known) in status.plan.cells.iter().zip(&status.cells) {
-        let kind = cell.described();
-        let index = kinds.iter().position(|(name, ..)| *name == kind).unwrap_or_else(|| {
-            kinds.push((kind, 0, 0));
-            kinds.len() - 1
+        let description = cell.described();
+        let index = rows.iter().position(|(name, ..)| *name == description).unwrap_or_else(|| {
+            rows.push((description, 0, 0));
+            rows.len() - 1
         });
-        kinds[index].1 += usize::from(matches!(known, CellStatus::Done(_)));
-        kinds[index].2 += 1;
+        rows[index].1 += usize::from(matches!(known, CellStatus::Done(_)));
+        rows[index].2 += 1;
     }
     let mut seen = BTreeSet::new();
     let sets: Vec<&str> = (status.plan.cells.iter().flat_map(|cell| &cell.tests.sets))
@@ -138,16 +138,16 @@ fn kinds(status: &ExperimentStatus) -> Markup {
             table.rates {
                 thead {
                     tr {
-                        th scope="col" { "environment, learner, trained on" }
+                        th scope="col" { "environment, method, trained on" }
                         th scope="col" { "cells" }
                         @for set in &sets { th.number scope="col" { "on " (set) } }
                     }
                 }
                 tbody {
-                    @for (kind, done, all) in &kinds {
-                        @let rate = rates.iter().find(|rate| rate.kind == *kind);
+                    @for (description, done, all) in &rows {
+                        @let rate = rates.iter().find(|rate| rate.kind == *description);
                         tr {
-                            th scope="row" { (kind) }
+                            th scope="row" { (description) }
                             td.number { (done) " of " (all) }
                             @for set in &sets {
                                 td.number {
@@ -177,7 +177,7 @@ fn working(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &Re
             div.wide {
                 table.working {
                     thead { tr { @for name in ["cell", "training", "success, last 100", "doing"] { th scope="col" { (name) } } } }
-                    tbody { @for cell in cells().take(MAX_LISTED) { (one(cell, experiment, relative)) } }
+                    tbody { @for cell in cells().take(MAX_LISTED) { (working_row(cell, experiment, relative)) } }
                 }
             }
             @if more > 0 { p { "And " (more) " more." } }
@@ -185,7 +185,8 @@ fn working(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &Re
     }
 }
 
-fn one(cell: &Cell, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
+/// Returns the row of a running cell.
+fn working_row(cell: &Cell, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     let training = experiment.training(&cell.id).and_then(|training| training.status().ok());
     let episodes = training.map_or(0, |status| status.episodes);
     let budget = cell.config.common.episodes;
@@ -217,7 +218,7 @@ fn lag(lags: bool) -> Markup {
 /// Returns the map of all cells, which shows each cell as a square in the colour of its state.
 fn map(status: &ExperimentStatus, experiment: &LiveExperiment, relative: &RelativePath) -> Markup {
     if status.cells.len() > MAX_MAPPED {
-        return html! { p { (grouped(status.cells.len())) " cells are too many to draw one by one." } };
+        return html! { p { (grouped(status.cells.len())) " cells are too many for the map of cells." } };
     }
     let word = |known: &CellStatus| match known {
         CellStatus::Done(_) => "done",

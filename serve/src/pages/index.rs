@@ -62,7 +62,7 @@ fn runs(root: &Root, index: &Index) -> Markup {
             }
         }
         @if index.more_runs > 0 {
-            p { "And " (grouped(index.more_runs)) " more, which changed before these." }
+            p { "And " (grouped(index.more_runs)) " more, which changed earlier." }
         }
         @if !index.links_out.is_empty() {
             p {
@@ -123,9 +123,9 @@ fn milliseconds(time: Duration) -> String {
 fn server_section((address, last): &PolledServer<'_>) -> Markup {
     let text = |text: String| html! { (text) };
     html! {
-        h2 { "Server of environments" }
+        h2 { "Environment server" }
         @match last {
-            None => p { code { (address) } " was not asked yet." },
+            None => p { code { (address) } " has not been asked yet." },
             Some(Err(reason)) => { (super::faults(&[format!("{address} does not take sessions: {reason}")])) },
             Some(Ok(answer)) => { p { code { (address) } } (facts([
                 ("state", html! { (badge("takes sessions")) }),

@@ -31,7 +31,7 @@ use crate::paths::{RelativePath, Root};
 pub(crate) struct Update {
     /// Title of the browser window.
     pub(crate) title: String,
-    /// Kind of the run; `None` for the list of all runs.
+    /// Kind of the run; `None` for pages that are not about a single run.
     pub(crate) kind: Option<RunKind>,
     /// The parts of the page, by their names.
     pub(crate) parts: Vec<(&'static str, Markup)>,
@@ -41,7 +41,7 @@ pub(crate) struct Update {
     pub(crate) report: u64,
     /// Files of the report of an experiment or an assessment; `None` for other pages.
     pub(crate) report_source: Option<ReportSource>,
-    /// Links to the runs whose folders contain the folder of this page's run.
+    /// Links to the served folder, and to the runs whose folders contain the folder of this page's run.
     breadcrumbs: Markup,
 }
 
@@ -71,7 +71,7 @@ impl Update {
         json!({ "title": self.title, "parts": parts, "charts": self.charts, "report": report }).to_string()
     }
 
-    /// Returns a part of the page, in an element that the page's script can replace.
+    /// Returns a part of the page, in an element whose content the page's script can replace.
     fn part(&self, name: &str) -> Markup {
         let content = self.parts.iter().find(|(known, _)| *known == name).map(|(_, part)| part);
         html! { div id=(name) data-part { @if let Some(content) = content { (content) } } }
@@ -98,7 +98,7 @@ fn describe(error: &ViewError) -> (StatusCode, String) {
         ViewError::RunNotFound => (StatusCode::NOT_FOUND, "There is no run here, or not any more.".into()),
         ViewError::Unlisted(reason) => (StatusCode::NOT_FOUND, format!("The runs cannot be listed: {reason}.")),
         ViewError::Load(CachedLoadError::Panicked) => {
-            let message = "The server cannot show this because of a fault of its own. Its console has the details.";
+            let message = "The server cannot show this because of a bug in it. Its console has the details.";
             (StatusCode::INTERNAL_SERVER_ERROR, message.into())
         }
         ViewError::Load(CachedLoadError::TimedOut) => {
@@ -135,7 +135,7 @@ fn document(title: &str, events: &str, breadcrumbs: &Markup, main: &Markup) -> S
             }
             body data-events=(events) {
                 header.top {
-                    nav aria-label="Where this is" { (breadcrumbs) }
+                    nav aria-label="Breadcrumbs" { (breadcrumbs) }
                     p #live role="status" { noscript { "Without JavaScript this page does not update itself; reload it to see changes." } }
                 }
                 main { (main) }

@@ -92,14 +92,15 @@ fn head(status: &TrainingStatus, training: &LiveTraining) -> Markup {
             @if let Some(left) = training.remaining_seconds() { ", about " (duration(left)) " left" }
             "; changed " (time(training.changed())) ". "
             @match status.saved {
-                Some(saved) => { "The last checkpoint has " (number(saved)) " episodes." },
+                Some(saved) => { "The last checkpoint was written after " (number(saved)) " episodes." },
                 None => "There is no checkpoint yet.",
             }
         }
     }
 }
 
-/// Returns a list of means over the last 100 episodes, and of numbers from the last update.
+/// Returns a list of figures: means over the last 100 episodes, the speed, totals of the training so far, and a
+/// statistic of the last update.
 fn figures(training: &LiveTraining, curve: &LearningCurve) -> Markup {
     let Some(progress) = training.progress() else { return Markup::default() };
     let text = |text: String| html! { (text) };

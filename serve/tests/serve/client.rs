@@ -154,8 +154,8 @@ pub fn write(path: &Path, content: &str) {
     std::fs::write(path, content).unwrap();
 }
 
-/// Writes the files of a training with this number of episodes. Half of them are successes, and the returns are 0, 1,
-/// 2, …
+/// Writes the files of a training with this number of episodes in `monitor.csv`. Half of them are successes, and the
+/// returns are 0, 1, 2, … The line in `progress.csv` always has 30 episodes.
 pub fn write_training(path: &Path, episodes: usize) {
     let text = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
     let config = TrainConfig::from_table("the test", text.parse().unwrap()).unwrap();
@@ -166,7 +166,7 @@ pub fn write_training(path: &Path, episodes: usize) {
     write(&path.join("progress.csv"), progress);
 }
 
-/// Returns the lines of monitor.csv for the episodes `from` to `to`.
+/// Returns the lines of `monitor.csv` for the episodes `from` to `to - 1`.
 pub fn lines(from: usize, to: usize) -> String {
     (from..to).map(|i| format!("{i},4,{}.0,{},1\n", i + 1, i % 2)).collect()
 }

@@ -1,4 +1,4 @@
-//! Contents of the pages, and when they change.
+//! Contents of the pages, and changes of the contents.
 
 use perturb_experiment::{ExperimentFolder, Plan};
 use perturb_files::Lock;

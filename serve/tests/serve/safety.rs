@@ -1,4 +1,4 @@
-//! Requests that the web server must refuse.
+//! Requests that the web server must refuse, the security headers of responses, and requests for parts of files.
 
 use std::os::unix::fs::symlink;
 

@@ -16,7 +16,8 @@ pub(super) struct ActionPath {
     oldest: usize,
     /// The action of the current step before noise and scale, `[A]`. `action_hold` may repeat it in the next step.
     held: Vec<f32>,
-    /// The action of the current step after noise and scale, `[A]`. The physics receive this action.
+    /// The continuous action of the current step after noise and scale, `[A]`, as the physics receive it. Not used for
+    /// discrete actions.
     acting: Vec<f32>,
 }
 
@@ -53,7 +54,7 @@ impl ActionPath {
         if values.action_delay > 0 {
             self.oldest = next_offset(oldest, self.neutral.len(), self.delayed.len());
         }
-        // `held` becomes the client's action after its delay. If the step repeats the previous action, `held` stays.
+        // `held` becomes the action that has now passed the delay, unless the step repeats the previous action.
         match (action, self.space) {
             // The index is exact in f32, because there are few choices.
             (Action::Discrete(choice), _) => {
@@ -112,7 +113,8 @@ impl ActionPath {
             ActionSpec::Continuous(_) => (number as f32).is_finite(),
         };
         if let Some(number) = saved.iter().find(|number| !is_legal(number)) {
-            return Err(Error::Snapshot { reason: format!("{number} is in one of its late actions") });
+            let reason = format!("its saved actions contain {number}, which is not valid");
+            return Err(Error::Snapshot { reason });
         }
         self.begin(values);
         let (held, delayed) = saved.split_at(self.held.len());

@@ -33,9 +33,9 @@ impl ChangingPhysics {
         Self { environment, is_changing: false, is_changed: false, sets, applied, applied_indices, state: Vec::new() }
     }
 
-    /// Stores the normal parameters `own` and the changed parameters `values.changed`, and applies the normal
-    /// parameters. If the physics can change, also reads the quantities of both sets back from the physics. The state
-    /// is undefined until the next reset.
+    /// Applies the normal parameters `own`. If the physics can change, also stores `own` and the changed parameters
+    /// `values.changed`, and reads the quantities of both sets back from the physics. The state is undefined until the
+    /// next reset.
     pub(super) fn set_parameters(&mut self, own: &[f64], values: &DisturbanceValues) {
         self.is_changing = values.is_changing();
         self.is_changed = false;
@@ -100,7 +100,10 @@ impl ChangingPhysics {
         let (own, is_changed) = match saved {
             [own @ .., 0.0] => (own, false),
             [own @ .., 1.0] if self.is_changing => (own, true),
-            _ => return Err(Error::Snapshot { reason: "it does not tell whether its physics are changed".into() }),
+            _ => {
+                let reason = "its mark of changed physics is missing, or does not fit its parameters".into();
+                return Err(Error::Snapshot { reason });
+            }
         };
         if is_changed != self.is_changed {
             self.is_changed = is_changed;

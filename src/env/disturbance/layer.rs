@@ -135,8 +135,8 @@ impl Environment for Disturbed {
         transition
     }
 
-    /// Appends the state of the physics, then the delayed actions, then the delayed observations. The noise of the
-    /// present observation is not stored: `observe` draws it again from the random stream of its step.
+    /// Appends the state of the physics, then the last action and the delayed actions, then the delayed observations.
+    /// The noise of the present observation is not stored: `observe` draws it again from the random stream of the step.
     fn save(&self, out: &mut Vec<f64>) {
         self.physics.save(out);
         self.actions.save(out);

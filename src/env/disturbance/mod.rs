@@ -1,4 +1,4 @@
-//! Disturbances: delayed, repeated, noisy or scaled actions, delayed, noisy or lost observations, pushes, and physics
+//! Disturbances: delayed, repeated, noisy or scaled actions; delayed, noisy or lost observations; pushes; and physics
 //! that change within an episode. docs/disturbances.md defines them.
 //!
 //! Every environment has a disturbed twin: the same environment with the disturbances appended to its parameters. A

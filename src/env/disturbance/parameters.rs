@@ -5,9 +5,11 @@ use perturb_protocol::disturbance::{CHANGED, DEFAULT_PUSH_INTERVAL};
 
 /// Maximal delay of actions or observations, in steps.
 const MAX_DELAY: usize = 100;
-/// Maximal total of numbers in all delayed actions of an environment. It limits the size of snapshots.
+/// Maximal total of numbers in all delayed actions of an environment. It limits the size of snapshots. A delay of one
+/// step is possible even if an action has more numbers.
 const MAX_LATE_ACTION_NUMBERS: usize = 2048;
-/// Maximal total of numbers in all delayed observations of an environment. It limits the size of snapshots.
+/// Maximal total of numbers in all delayed observations of an environment. It limits the size of snapshots. A delay of
+/// one step is possible even if an observation has more numbers.
 const MAX_LATE_OBSERVATION_NUMBERS: usize = 8192;
 /// Maximal number of actuators that have their own scale: the first actuators of the environment. The common scale
 /// applies to all actuators.
@@ -182,8 +184,8 @@ impl DisturbanceSet {
         Self { entries, action_width }
     }
 
-    /// Replaces disturbances by the parameters of the same name in `declared`, whose distributions for R and E may
-    /// differ.
+    /// Replaces each disturbance by the parameter of the same name in `declared`, if there is one. In versions R and E
+    /// such a parameter may draw other values than the default.
     pub(super) fn declare(&mut self, declared: &[ParameterSpec]) {
         for (_, parameter) in &mut self.entries {
             if let Some(own) = declared.iter().find(|own| own.name == parameter.name) {
@@ -192,13 +194,13 @@ impl DisturbanceSet {
         }
     }
 
-    /// The disturbances as parameters, in order.
+    /// Returns the disturbances as parameters, in order.
     pub(super) fn parameters(&self) -> impl Iterator<Item = ParameterSpec> + '_ {
         self.entries.iter().map(|(_, parameter)| *parameter)
     }
 
-    /// Returns how many numbers the delayed actions of an environment have together at most, and how many its delayed
-    /// observations, of `observation_size` numbers each.
+    /// Returns two maxima for an environment: the total of numbers in all delayed actions, and the total of numbers in
+    /// all delayed observations. Each observation has `observation_size` numbers.
     pub(super) fn max_late_numbers(&self, observation_size: usize) -> (usize, usize) {
         let longest = |wanted: DisturbanceKind| {
             let entry = self.entries.iter().find(|(kind, _)| *kind == wanted);

@@ -95,7 +95,8 @@ impl SensorPath {
         observe: impl FnOnce(&mut [f32]),
     ) -> Result<(), Error> {
         if let Some(number) = saved.iter().find(|number| !(**number as f32).is_finite()) {
-            return Err(Error::Snapshot { reason: format!("{number} is in one of its late observations") });
+            let reason = format!("its saved observations contain {number}, which is not valid");
+            return Err(Error::Snapshot { reason });
         }
         self.exact.resize((values.sensor_delay + 1) * self.channels.len(), 0.0);
         self.newest = saved.len();
@@ -120,7 +121,7 @@ fn add_noise<const N: usize>(
     for i in 0..N {
         let ChannelSpec { scale, low, high, .. } = channels[i];
         let noisy = f64::from(exact[i]) + sensor_noise * scale * normals[i];
-        // NaN fails both comparisons, and stays. `clamp` would be slower, because it checks the bounds.
+        // NaN fails both comparisons, and stays. `clamp` would be slower, because it also checks that `low` ≤ `high`.
         let noisy = if noisy < low { low } else { noisy };
         let noisy = if noisy > high { high } else { noisy };
         out[i] = if scale > 0.0 { finite(noisy) } else { exact[i] };

@@ -27,7 +27,8 @@ pub struct ReceivedPolicy {
     pub normalisers: Normalisers,
     /// Whether the policy is trained or tested, with the random stream of its actions.
     pub role: PolicyRole,
-    /// The saved state from which a training continues. If `None`, a trial begins in every environment.
+    /// The saved state from which a training continues. If `None`, the policy starts with an empty memory in every
+    /// environment, as at the start of a trial.
     pub state: Option<PlayerTrainingState>,
     /// All weights of the networks, `[P]`, finite.
     pub weights: Vec<f32>,
@@ -75,8 +76,8 @@ pub(in crate::pool) struct StepBuffers {
 }
 
 impl PolicyRunner {
-    /// Starts a policy in the environments of `shards`. The policy continues from its saved state. Without a saved
-    /// state, each environment begins a trial.
+    /// Starts a policy in the environments of `shards`, without resetting them. The policy continues from its saved
+    /// state. Without a saved state, its memory is empty, as at the start of a trial.
     pub(in crate::pool) fn begin(policy: ReceivedPolicy, shards: &[Mutex<Shard>]) -> Result<Self, Error> {
         let ReceivedPolicy { spec, inputs, normalisers, role, state, weights, episodes_per_trial } = policy;
         let trials: Vec<(u32, u64)> =

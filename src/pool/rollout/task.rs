@@ -42,7 +42,7 @@ pub struct RolloutRequest {
 }
 
 /// The result of a rollout: T steps of N environments, in arrays `[T, N, …]`, row-major and little-endian, as in
-/// messages.
+/// messages. With [`RolloutRequest::only_ended`] all arrays are empty.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Rollout {
     /// T, the number of steps.
@@ -63,14 +63,15 @@ pub struct Rollout {
     pub terminated: BytesMut,
     /// 1 where the step limit ended the last episode of a trial, u8 `[T, N]`.
     pub truncated: BytesMut,
-    /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`.
+    /// The value V of the last observation where `truncated` is 1, otherwise 0, f32 `[T, N]`. In a test always 0.
     pub truncation_values: BytesMut,
     /// The episodes that ended, ordered by step, then by slot. If the task is a number of episodes per environment,
     /// episodes beyond this number are left out.
     pub ended: Vec<RolloutEpisodeEnd>,
     /// Whether the policy's task was finished in this rollout.
     pub finished: bool,
-    /// The values V of the observations after the last step, f32 `[N]`; empty unless the task is finished.
+    /// The values V of the observations after the last step, f32 `[N]`; empty unless the task is finished. After a task
+    /// of complete episodes they are 0.
     pub last_values: BytesMut,
     /// The recurrent policy's memory before the first step of the task, f32 `[N, 2H]`; empty unless the task began in
     /// this rollout.
@@ -125,9 +126,9 @@ impl RolloutTask {
         self.error.map_or(Ok((self.runner, self.rollout)), Err)
     }
 
-    /// Records the outputs of the shards' last command and gives the shards the next command. Call this method each
-    /// time all shards have carried out a command. Returns false at the end of the rollout. If `halted`, the rollout
-    /// ends now.
+    /// Records the outputs of the shards' last command and gives the shards the next command. Call this method once to
+    /// start the rollout, and then each time all shards have carried out a command. Returns false at the end of the
+    /// rollout. If `halted`, the rollout ends now.
     pub(in crate::pool) fn after_step(&mut self, shards: &[Mutex<Shard>], halted: bool) -> bool {
         match self.advance(shards) {
             Ok(continues) => continues && !halted,

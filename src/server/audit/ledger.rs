@@ -78,7 +78,7 @@ impl Ledger {
         }
         let existing = read(path, |_, _| {}).map_err(io::Error::other)?;
         if existing.chain.lines() == 0 && existing.unfinished > 0 {
-            return Err(io::Error::other("that is no ledger, and not empty: give another name"));
+            return Err(io::Error::other("that is not a ledger, and not empty: give another name"));
         }
         let mut writer = LedgerWriter {
             file,

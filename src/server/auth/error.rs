@@ -8,15 +8,15 @@ use crate::server::error::{ErrorKind, RequestError};
 pub enum Error {
     /// A call has no token, but this server requires one.
     #[error(
-        "this server asks for a token, and none came; ask who runs it for one, and name the file that has it in \
+        "this server requires a token, and none was sent; ask its operator for one, and name the file that has it in \
          PERTURB_TOKEN_FILE, or send it as the metadata `authorization: Bearer TOKEN`"
     )]
     NoToken,
     /// A call has a token that this server does not know.
-    #[error("this server does not know the token that came; ask who runs it for one that is good")]
+    #[error("this server does not know the token that was sent; ask its operator for a valid one")]
     WrongToken,
     /// The session's token was removed from the token file, or its role was changed there.
-    #[error("the token {name:?} was revoked, or has another role now; ask who runs this server")]
+    #[error("the token {name:?} was revoked, or has another role now; ask the operator of this server")]
     RevokedToken {
         /// The token's name.
         name: String,
@@ -38,8 +38,9 @@ pub enum Error {
     },
     /// The token's sessions have run more steps than its rate allows, and would have to wait for too long.
     #[error(
-        "the token {name:?} may take {rate} steps a second here, including the price of other requests, and its sessions are \
-         {seconds} s ahead of that; step fewer environments at a time or in fewer sessions, or try again later"
+        "the token {name:?} may take {rate} steps per second here, including the price of other requests, and its \
+         sessions are {seconds} s ahead of that; step fewer environments at a time or in fewer sessions, or try \
+         again later"
     )]
     TooFast {
         /// The token's name.

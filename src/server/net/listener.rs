@@ -30,13 +30,15 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
             format!("cannot listen at {text}: another program does; end it, or take a free port with {flag} {free}")
         }
         (_, ErrorKind::AddrInUse) => {
-            format!("cannot listen at {text}: another program does, or the file is no socket; give {flag} another path")
+            format!(
+                "cannot listen at {text}: another program does, or the file is not a socket; give {flag} another path"
+            )
         }
         (_, ErrorKind::AddrNotAvailable) => {
-            format!("cannot listen at {text}: it is no address of this machine; {flag} tcp://0.0.0.0:PORT means all")
+            format!("cannot listen at {text}: this machine has no such address; {flag} tcp://0.0.0.0:PORT means all")
         }
         (_, ErrorKind::NotFound) => {
-            format!("cannot listen at {text}: its folder is not there; create it, or correct {flag}")
+            format!("cannot listen at {text}: its folder does not exist; create it, or correct {flag}")
         }
         _ => format!("cannot listen at {text}: {error}; correct {flag}"),
     }

@@ -47,7 +47,7 @@ fn build_config(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, 
         .map_err(|error| error.to_string())?
         .with_client_cert_verifier(clients)
         .with_single_cert(chain, key)
-        .map_err(|error| format!("{cert} and {key_file} do not go together: {error}"))?;
+        .map_err(|error| format!("{cert} and {key_file} do not match: {error}"))?;
     config.alpn_protocols = vec![b"h2".to_vec()];
     Ok(config)
 }

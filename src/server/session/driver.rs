@@ -1,6 +1,6 @@
 //! The task that runs a session. A session without a lease ends with its stream. A session with a lease outlives its
-//! stream for a while, and another stream may attach to it: requests are carried out even while no stream waits for the
-//! reply, and the last replies are stored for sending them again.
+//! stream for a while, and another stream may attach to it. A request that was being answered when the stream was lost
+//! is completed, and the last replies are stored for sending them again.
 
 use super::{
     Error,
@@ -355,7 +355,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         let needs_memory =
             |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
         if answer.as_ref().is_err_and(|error| needs_memory(error.kind())) {
-            stored.clear(); // the client has received them, and they take memory that the request needs
+            stored.clear(); // they were all sent, and they take memory that the request needs
         }
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);

@@ -21,8 +21,8 @@ impl<R> ReplayBuffer<R> {
         self.last
     }
 
-    /// Records that a request arrived. A client sends a request only while fewer than `max_unanswered` are unanswered,
-    /// so it has received all older replies. Drops these replies.
+    /// Records that a request arrived. Including this request, at most `max_unanswered` requests of the client lack a
+    /// reply. So the client has received all stored replies but the last `max_unanswered` - 1. Drops the received ones.
     pub fn on_request(&mut self) {
         let received = (self.replies.len() + 1).saturating_sub(self.max_unanswered);
         self.replies.drain(..received);
@@ -101,7 +101,7 @@ mod tests {
         /// A client with at most `max_unanswered` unanswered requests finds all replies that it has not received. The
         /// server never stores more.
         #[test]
-        fn nothing_that_was_not_received_is_let_go_and_no_more_is_held(
+        fn unreceived_replies_stay_stored_within_the_limit(
             max_unanswered in 1_usize..8,
             moves in prop::collection::vec(0_u8..3, 0..200),
         ) {

@@ -30,8 +30,8 @@ pub enum Error {
     },
     /// The rest of a message did not arrive within the timeout.
     #[error(
-        "a message is incomplete: no byte of it came for {seconds} s, or it came at less than {rate} bytes a second; send \
-         each message without pauses"
+        "a message is incomplete: no byte of it came for {seconds} s, or it came at less than {rate} bytes per second; \
+         send each message without pauses"
     )]
     Unfinished {
         /// The maximum pause within a message, s.

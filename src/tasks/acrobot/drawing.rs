@@ -4,6 +4,7 @@ use super::HEIGHT;
 use crate::scene::{Drawing, colour, polar};
 use std::f64::consts::FRAC_PI_2;
 
+/// Width of a drawn link, in m.
 const LINK: f64 = 0.2;
 
 /// Draws the links. `angles` are the angle of link 1 from hanging down and the angle of link 2 relative to link 1, in

@@ -7,6 +7,7 @@ use std::f64::consts::FRAC_PI_2;
 
 const CART: ScenePoint = [0.25, 0.22]; // half width, height
 const WHEEL: f64 = 0.07;
+/// Width of the drawn pole, in m.
 const POLE: f64 = 0.09;
 
 /// Draws the cart and its pole. `position` and `half_pole_length` are in m, `angle` is in rad from upright, clockwise.

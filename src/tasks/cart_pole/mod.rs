@@ -13,8 +13,8 @@ use crate::{
     scene::Scene,
 };
 
-/// The specification of CartPole. Observations have no bounds, because the last observation of an episode is beyond the
-/// limits that end the episode.
+/// The specification of CartPole. Observations have no bounds, because the last observation of an episode may be beyond
+/// the limits that end the episode.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {
     name: "CartPole",
     revision: 1,

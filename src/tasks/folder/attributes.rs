@@ -65,8 +65,9 @@ impl<'a, 'input> ModelText<'a, 'input> {
     }
 }
 
-/// Returns a model's text without the geoms that affect only pictures, and without the meshes that only these geoms
-/// use. The physics stay the same byte for byte. Compilation becomes faster, because meshes take most of its time.
+/// Returns a model's text without the unnamed geoms that affect only pictures, and without the named meshes that no
+/// remaining geom uses. The physics stay the same byte for byte. Compilation becomes faster, because meshes take most
+/// of its time.
 ///
 /// # Errors
 /// [`super::Error`] if the text is not XML.

@@ -126,12 +126,12 @@ fn friction(
     field: &str,
 ) -> Result<()> {
     let geoms = &edit.targets.ids;
-    // The edited geoms must have possible contacts, and the contacts must have the edited kind of friction.
+    // At least one of the edited geoms must have a possible contact with the edited kind of friction.
     let contacts: Vec<Contact> = geoms.iter().flat_map(|&geom| contacts_of(model, geom)).collect();
     if contacts.is_empty() {
         let name = escaped(edit.targets.names.first().map_or("", String::as_str));
         let why = if model.options().collision == 1 || model.count(ElementKind::Pair) > 0 {
-            "only declared pairs of it can touch, which have a friction of their own; edit the pairs"
+            "it touches only in declared pairs, which have their own friction; edit the pairs"
         } else {
             "it can touch nothing; see its contype and conaffinity"
         };
@@ -171,8 +171,9 @@ fn friction(
         }
     };
     // MuJoCo uses the larger friction of two touching geoms, so an edited friction below the other geom's has no
-    // effect. If other geoms are fixed, the limit is the maximum of their frictions, because robots walk on them.
-    // Otherwise the limit is the minimum of the moving geoms' frictions.
+    // effect. If any of the other geoms are fixed, the limit is the maximum of their frictions, because robots walk on
+    // them. Otherwise the limit is the minimum of the moving geoms' frictions. In this second case there is no limit if
+    // an edited geom has priority in a contact, or if the friction of a geom that it can touch is edited, too.
     let fixed = others.clone().filter(|contact| contact.other_is_fixed).max_by(|a, b| limit(a).total_cmp(&limit(b)));
     let moving = others.min_by(|a, b| limit(a).total_cmp(&limit(b)));
     let counts = |contact: &&Contact| contact.dimension >= needed;

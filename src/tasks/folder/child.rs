@@ -1,5 +1,5 @@
-//! Loads a folder in a separate process first, because MuJoCo 2.2.2 aborts the process on some models and never
-//! finishes the compilation of others.
+//! Loads a folder in a separate process before the server itself loads the folder. The reason is that MuJoCo 2.2.2
+//! aborts the process on some models and never finishes the compilation of others.
 
 use super::error::{LoadError, escaped};
 use rustix::process::{Resource, Rlimit, setrlimit};
@@ -21,7 +21,8 @@ const MAX_CPU_SECONDS: u64 = 60;
 const MAX_WALL_SECONDS: u64 = 120;
 /// Interval between two checks whether the process has ended.
 const POLL_INTERVAL: Duration = Duration::from_millis(2);
-/// Maximal length of the process's output and of its errors that is stored, in bytes. The rest is dropped.
+/// Maximal number of bytes that are stored of the process's standard output, and of its standard error. The rest is
+/// dropped.
 const MAX_OUTPUT_BYTES: u64 = 1 << 20;
 
 /// Limits the memory and CPU time of this process, and disables core files. Call it in a process that will load an
@@ -80,9 +81,13 @@ fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
     const CPU_TIME: i32 = 24;
     let memory = MAX_MEMORY_BYTES >> 30;
     match status.signal() {
-        Some(CPU_TIME | KILLED) => {
+        Some(CPU_TIME) => {
             format!("MuJoCo needed more than {MAX_CPU_SECONDS} s to compile the model; use a smaller one")
         }
+        Some(KILLED) => format!(
+            "MuJoCo needed more than {MAX_CPU_SECONDS} s to compile the model, or the system killed the process for \
+             lack of memory; use a smaller model"
+        ),
         Some(ABORTED) => format!(
             "MuJoCo 2.2.2 aborted while it compiled the model, for instance because it needs more than {memory} GiB; look at \
              the numbers in <size>, and at the sizes of composites and height fields"
@@ -97,7 +102,8 @@ fn how_it_ended(status: ExitStatus, last_words: Option<&str>) -> String {
     }
 }
 
-/// Waits for the end of a process. Kills it after [`MAX_WALL_SECONDS`] and returns `None`.
+/// Waits for the end of a process. If the process has not ended after [`MAX_WALL_SECONDS`], kills it and returns
+/// `None`.
 fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
     let start = Instant::now();
     while start.elapsed() < Duration::from_secs(MAX_WALL_SECONDS) {

@@ -99,8 +99,8 @@ pub(super) fn actuated_joint(model: &Model, actuator: usize) -> Option<usize> {
 fn matches(pattern: &str, name: &str) -> bool {
     let (pattern, name): (Vec<char>, Vec<char>) = (pattern.chars().collect(), name.chars().collect());
     let (mut p, mut n) = (0, 0);
-    // The index of the last star in the pattern, and the index in the name up to which that star matches. After a
-    // mismatch, the star is extended by one more character.
+    // The index in the pattern of the last star that was read, and the index in the name up to which that star matches.
+    // After a mismatch, the star is extended by one more character.
     let mut star: Option<(usize, usize)> = None;
     while n < name.len() {
         match pattern.get(p) {

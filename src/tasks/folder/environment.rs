@@ -56,7 +56,8 @@ pub(super) struct FolderTask {
     pub(super) applied: Vec<AppliedQuantity>,
     /// The index of the body that is pushed; `None` if no body can move.
     pub(super) pushed_body: Option<usize>,
-    /// The disturbances whose values in versions R and E the file configures. The catalogue lists them as parameters.
+    /// The disturbances whose values in versions R and E the file configures. If there are any, the catalogue lists all
+    /// disturbances as parameters.
     pub(super) disturbances: Vec<ParameterSpec>,
     pub(super) needs: Needs,
     /// Whether the model's text has `settotalmass`, which scales all masses. Edited masses are not scaled again.
@@ -68,7 +69,7 @@ pub(super) struct FolderTask {
 pub(super) struct Needs {
     pub(super) stage: Stage,
     pub(super) external_forces: bool,
-    /// The total of numbers that reward terms remember from one step to the next.
+    /// The total number of values that reward terms remember from one step to the next.
     pub(super) n_remembered: usize,
 }
 
@@ -91,13 +92,13 @@ impl Needs {
 /// An environment of a folder.
 ///
 /// A step sets the controls to the action, clipped to their range, and simulates `frame_skip` timesteps. Then the
-/// environment computes health, the terms of the reward, the observation and the achieved value, in this order, from
-/// the same state.
+/// environment computes health, the terms of the reward, the goal, the observation and the achieved value, in this
+/// order, from the same state.
 ///
-/// The physics diverge if MuJoCo raises a warning or a fatal error, or if a reading is not finite. Examples of warnings
-/// are a bad number and dropped contacts. After a divergence the episode terminates, all terms except those of the kind
-/// `healthy` are 0, and the observation of the previous step stays. If a reset sets a state that diverges at once, the
-/// observation is all zeros.
+/// The physics diverge if MuJoCo raises a warning or a fatal error. Examples of warnings are a bad number and dropped
+/// contacts. The physics also count as diverged if a number of the reward, the observation or the achieved value is not
+/// finite. After a divergence the episode terminates, all terms except those of the kind `healthy` are 0, and the
+/// observation of the previous step stays. If a reset sets a state that diverges at once, the observation is all zeros.
 ///
 /// An environment has no simulation of its own. Before each step, the environment's parameters and state are written
 /// into a shared simulation. After the step, the environment stores the new state and the results.
@@ -203,11 +204,11 @@ impl FolderEnvironment {
         if !numbers.iter().all(|&value| (value as f32).is_finite()) {
             return false;
         }
-        let achieved = self.task.goal.achieved.as_ref().map(|(best, reading)| {
+        let achieved = self.task.goal.achieved.as_ref().map(|(aggregate, reading)| {
             let n = numbers.len();
             reading.read(simulation, context, numbers);
             let now = numbers.drain(n..).next().unwrap_or(f64::NAN);
-            match best {
+            match aggregate {
                 Aggregate::Greatest if !is_first => self.achieved.max(now),
                 Aggregate::Least if !is_first => self.achieved.min(now),
                 _ => now,

@@ -24,7 +24,7 @@ use crate::{
     scene::Look,
 };
 use perturb_mujoco::{ElementKind, Flags, Index, Model, ModelField};
-use perturb_protocol::names::is_spelled;
+use perturb_protocol::{disturbance::CHANGED, names::is_spelled};
 
 /// The keys at the top level of `task.toml`.
 pub(super) const KEYS: &[&str] = &[
@@ -61,6 +61,7 @@ const MAX_TIMESTEP_SECONDS: f64 = 1.0;
 const MAX_MODEL_BYTES: usize = 64 << 20;
 const MAX_SIMULATION_BYTES: usize = 64 << 20;
 const MAX_DOFS: usize = 256;
+const MAX_ACTUATORS: usize = 2048;
 const MAX_OBSERVATION: usize = 4096;
 const MAX_PARAMETERS: usize = 32;
 const MAX_TERMS: usize = 64;
@@ -82,8 +83,8 @@ pub(super) fn read(files: &mut Files) -> Result<FolderTask> {
     let about = Header::new(&top)?;
     let main = top.require("model", "\"robot.xml\"")?.text()?;
     let mut mjcf = mjcf::read(files, main)?;
-    // Geoms that affect only pictures are removed, unless the file refers to elements by index (`#3`), because removing
-    // geoms changes indices.
+    // If parameters edit lengths, geoms that affect only pictures are removed from the physics, so that compilation is
+    // faster. They are kept if the file refers to elements by index (`#3`), because removing geoms changes indices.
     if edits_lengths(&top) && !text.contains("\"#") && !text.contains("'#") {
         mjcf.physics = attributes::without_visual_geoms(&mjcf.physics)?;
         mjcf.lacks_visual_geoms = true;
@@ -116,12 +117,14 @@ impl Header {
         let name = name_value.text()?;
         let plain = name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_');
         if !plain || !name.starts_with(|c: char| c.is_ascii_alphabetic()) || name.len() > MAX_NAME_CHARS {
-            let problem = "is no name of a task; expected a letter, then letters and digits, at most 64 together";
+            let problem = "is not a valid name of a task; expected a letter, then letters, digits and underscores, at \
+                           most 64 characters";
             return Err(name_value.error(format_args!("{:?} {problem}", escaped(name))));
         }
         let built_in = crate::tasks::catalogue();
         if let Some(taken) = built_in.names().find(|known| is_spelled(name, known)) {
-            let problem = format!("{:?} is the name of a built-in environment, {taken}; give another", escaped(name));
+            let name = escaped(name);
+            let problem = format!("{name:?} is the name of a built-in environment, {taken}; choose another name");
             return Err(name_value.error(problem));
         }
         let description = top.require("description", "\"Walk forward on two legs.\"")?;
@@ -156,20 +159,20 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
         other => Error::file(main, other),
     })?;
     let refuse = |problem: String| Err(Error::file(main, problem));
-    let megabytes = |bytes: usize| bytes.div_ceil(1 << 20);
+    let mebibytes = |bytes: usize| bytes.div_ceil(1 << 20);
     if model.n_v() > MAX_DOFS {
         return refuse(format!("the model has {} degrees of freedom, the limit is {MAX_DOFS}", model.n_v()));
     }
     if model.model_bytes() > MAX_MODEL_BYTES {
-        let (own, most) = (megabytes(model.model_bytes()), megabytes(MAX_MODEL_BYTES));
+        let (own, most) = (mebibytes(model.model_bytes()), mebibytes(MAX_MODEL_BYTES));
         return refuse(format!(
-            "the model takes {own} MB without its pictures, the limit is {most} MB; use smaller meshes"
+            "the model takes {own} MiB without its pictures, the limit is {most} MiB; use smaller meshes"
         ));
     }
     if model.simulation_bytes() > MAX_SIMULATION_BYTES {
-        let (own, most) = (megabytes(model.simulation_bytes()), megabytes(MAX_SIMULATION_BYTES));
+        let (own, most) = (mebibytes(model.simulation_bytes()), mebibytes(MAX_SIMULATION_BYTES));
         return refuse(format!(
-            "a simulation of it would take {own} MB, the limit is {most} MB: lower njmax, nconmax or nstack in <size>"
+            "a simulation of it would take {own} MiB, the limit is {most} MiB: lower njmax, nconmax or nstack in <size>"
         ));
     }
     let timestep = model.timestep();
@@ -183,6 +186,9 @@ fn compile(mjcf: &Mjcf, main: &str) -> Result<Model> {
     }
     if model.n_u() == 0 {
         return refuse("the model has no actuators, so there are no actions; add some to <actuator>".into());
+    }
+    if model.n_u() > MAX_ACTUATORS {
+        return refuse(format!("the model has {} actuators, the limit is {MAX_ACTUATORS}", model.n_u()));
     }
     Ok(model)
 }
@@ -222,7 +228,7 @@ fn assemble(
     let push = top.get("push").map(|value| value.table()).transpose()?;
     let push = Push::new(push.as_ref(), &template.model, &elements)?;
     let needs = Needs::new(&observation, &reward, &healthy, &goal);
-    // The description. Its closure `make` is set in `load`, when the task has its final address.
+    // The specification. Its closure `make` is set in `load`, when the task has its final address.
     let quantities =
         parameters.iter().map(|edited| QuantitySpec { name: edited.parameter.name, unit: edited.parameter.unit });
     let spec = EnvironmentSpec {
@@ -335,6 +341,10 @@ fn parameters(
     }
     let mut names = std::collections::BTreeSet::new();
     let mut unique = |table: &TomlTable<'_>, name: &'static str| {
+        if name.starts_with(CHANGED) {
+            let problem = format!("names of values after a change begin with {CHANGED:?}; choose another name");
+            return Err(table.error(format_args!("{name}: {problem}")));
+        }
         let problem = "there are two parameters or applied quantities of this name; give each a name of its own";
         if names.insert(name) { Ok(()) } else { Err(table.error(format_args!("{name}: {problem}"))) }
     };

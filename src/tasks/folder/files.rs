@@ -47,10 +47,10 @@ impl Files {
             return Err(refuse("this is not a folder; give the folder that holds task.toml".into()));
         }
         if !root.join(TASK).exists() {
-            return Err(refuse("the folder has no task.toml; docs/tasks.md says what stands in it".into()));
+            return Err(refuse("the folder has no task.toml; docs/tasks.md describes this file".into()));
         }
         let mut files = Self { root, read: BTreeMap::new(), bytes: 0 };
-        if files.read(TASK, "it")?.len() > MAX_TASK_BYTES {
+        if files.read(TASK, "the folder")?.len() > MAX_TASK_BYTES {
             return Err(Error::file(TASK, "the file is longer than 1 MiB"));
         }
         Ok(files)
@@ -61,8 +61,8 @@ impl Files {
         self.read.get(TASK).map_or(&[], |file| file.bytes.as_slice())
     }
 
-    /// Returns the content of the file at a path within the folder, and reads it if it was not read before. `who` is
-    /// the name of the file that refers to this file, for instance `robot.xml`; error messages contain it.
+    /// Returns the content of the file at a path within the folder, and reads it if it was not read before. `who` tells
+    /// in error messages which file refers to this file, for instance `robot.xml, line 12`.
     ///
     /// # Errors
     /// [`Error`] if the path leaves the folder, if the file cannot be read, or if a limit is exceeded.
@@ -103,7 +103,7 @@ impl Files {
         let room = MAX_BYTES - self.bytes;
         std::fs::File::open(&path).and_then(|file| file.take(room + 1).read_to_end(&mut bytes)).map_err(unreadable)?;
         if bytes.len() as u64 > room {
-            return Err(Error::folder("the files of the folder that are read have more than 64 MiB together"));
+            return Err(Error::folder("the files that the task needs exceed 64 MiB in total"));
         }
         if self.read.len() >= MAX_FILES {
             return Err(Error::folder(format_args!("more than {MAX_FILES} files of the folder are read")));
@@ -112,8 +112,9 @@ impl Files {
         Ok(FileContent { bytes, modified: about.modified().ok() })
     }
 
-    /// Returns a hash of all files that were read: the SHA-256, in hexadecimal, of each file's path and the SHA-256 of
-    /// its content. `task.toml` comes first, then the other files, ordered by path.
+    /// Returns a hash of all files that were read, in hexadecimal. The SHA-256 covers for each file the length of its
+    /// path (8 bytes, little-endian), the path, and the SHA-256 of the content. `task.toml` comes first, then the other
+    /// files, ordered by path.
     pub(super) fn hash(&self) -> String {
         let task = self.read.get_key_value(TASK);
         let others = self.read.iter().filter(|(name, _)| *name != TASK);

@@ -162,7 +162,8 @@ impl EditedText {
         Ok(Self { pieces })
     }
 
-    /// Returns the MJCF text with edited lengths. `amounts` has what [`EditedLength::amount`] returned for each of them.
+    /// Returns the MJCF text with edited lengths. `amounts` has the result of [`EditedLength::amount`] for each entry
+    /// of `edited_lengths`.
     pub(super) fn write(&self, edited_lengths: &[EditedLength], amounts: &[f64]) -> String {
         let mut text = String::new();
         for piece in &self.pieces {
@@ -182,7 +183,7 @@ impl EditedText {
     }
 }
 
-/// The [`EditedLength`] that scales a body, by its index.
+/// The index of the [`EditedLength`] that scales a body, if any.
 #[derive(Clone, Copy, Default)]
 struct Scaling {
     /// The index of the [`EditedLength`] that scales positions and lengths.
@@ -284,7 +285,7 @@ impl<'a, 'input> Editor<'a, 'input> {
         if let Some(length_index) = shifts.into_iter().flatten().next()
             && (carried.is_some() || own.is_some())
         {
-            let problem = "a length moves this body, too; edit one of both";
+            let problem = "a length moves this body, too; edit only one of the two";
             return Err((self.refuse)(length_index, problem));
         }
         let position = self.numbers(node, "pos", &[0.0; 3])?;
@@ -358,14 +359,15 @@ impl<'a, 'input> Editor<'a, 'input> {
         if let (Some(_), Some(length_index)) = (radius, size) {
             return Err((self.refuse)(
                 length_index,
-                "another edit sets the radius of one of its geoms, too; edit one of both",
+                "another edit sets the radius of one of its geoms, too; edit only one of the two",
             ));
         }
         let Some(length_index) = along.or(radius) else { return Ok(()) };
         // An edit that affects neither contacts nor the inertia is refused.
         let kind = self.attributes.get(node, "type").unwrap_or("sphere");
-        let (none, touches) = (along.is_none() && has_inertial, geom.is_some_and(|geom| can_touch(self.model, geom)));
-        if none && !touches {
+        let keeps_inertia = along.is_none() && has_inertial;
+        let touches = geom.is_some_and(|geom| can_touch(self.model, geom));
+        if keeps_inertia && !touches {
             let problem =
                 "it has no effect: one of its geoms can touch nothing, and its body has an <inertial> of its own";
             return Err((self.refuse)(length_index, problem));
@@ -418,7 +420,7 @@ impl<'a, 'input> Editor<'a, 'input> {
     fn numbers(&self, node: Node<'a, 'input>, key: &str, absent: &[f64]) -> Result<Vec<f64>> {
         let Some(text) = self.attributes.get(node, key) else { return Ok(absent.to_vec()) };
         let numbers = text.split_whitespace().map(|number| number.parse().ok()).collect::<Option<Vec<f64>>>();
-        numbers.ok_or_else(|| (self.refuse)(0, &format!("{key}=\"{text}\" of the model is no list of numbers")))
+        numbers.ok_or_else(|| (self.refuse)(0, &format!("{key}=\"{text}\" of the model is not a list of numbers")))
     }
 
     /// Replaces an attribute of an element by edited numbers.

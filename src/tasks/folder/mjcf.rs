@@ -48,7 +48,7 @@ pub(super) struct Text {
     pub(super) xml: String,
     /// The names and contents of the files, for [`perturb_mujoco::Model::from_files`].
     pub(super) files: Vec<(String, Vec<u8>)>,
-    /// For each line of the text the original file (an index in `sources`) and line.
+    /// For each line of the text, the original file (an index in `sources`) and line.
     lines: Vec<(usize, u32)>,
     /// The names of the original files.
     sources: Vec<String>,

@@ -3,10 +3,12 @@
 //! The modules, in the order in which a folder passes through them:
 //!
 //! - `child` loads a new folder in a separate process first, because MuJoCo may crash or hang.
+//! - `load` then loads the folder in the server's process, by the following modules.
 //! - `files` reads the files of the folder; `table` reads TOML, and reports the line of each error.
 //! - `mjcf` resolves includes and writes the model's text for MuJoCo; `elements` finds model elements by name.
-//! - `file` builds the task from its parts: `reading` and `number` (what is read from the simulation), `reward`,
-//!   `rules`, `reset`, `parameter` and `target` (what a parameter edits).
+//! - `file` builds the task from its parts: `reading`, `reading_source` and `number` (what is read from the
+//!   simulation), `reward`, `rules`, `reset`, `parameter` and `target` (what a parameter edits), `declared` (pushes and
+//!   disturbances), and `picture` (the camera).
 //! - `checks` refuses edits that cannot have an effect; `effect` finds edits that have no visible effect.
 //! - `lengths` edits lengths in the model's text, with the help of `attributes`; `recompilation` compiles the edited
 //!   text.

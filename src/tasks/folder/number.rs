@@ -97,15 +97,15 @@ pub(super) fn unique_channels<'a>(entries: impl Iterator<Item = &'a NumberDescri
     names
 }
 
-/// Creates the description of a number without bounds. Its name is `element.part`, or `element` if `part` is empty; its
-/// channel name is made from `suffix`.
-pub(super) fn entry(element: &str, part: &str, suffix: String, unit: &'static str) -> NumberDescription {
+/// Creates the description of a number without bounds. Its name is `element.part`, or `element` if `part` is empty. Its
+/// channel name is made from the text `channel`.
+pub(super) fn entry(element: &str, part: &str, channel: String, unit: &'static str) -> NumberDescription {
     let name = if part.is_empty() { element.to_owned() } else { format!("{element}.{part}") };
     NumberDescription {
         name,
         element: element.to_owned(),
         kind: "",
-        channel: channel_name(&suffix),
+        channel: channel_name(&channel),
         unit,
         low: f64::NEG_INFINITY,
         high: f64::INFINITY,

@@ -70,11 +70,11 @@ impl EditedParameter {
         for edit in &self.edits {
             for (target, value) in edit.targets.all.iter().flat_map(|target| [(target, low), (target, high)]) {
                 let number = edit.number(target.value(model), value);
-                if let Some((least, strict)) = edit.targets.least()
-                    && (number < least || (strict && number == least))
+                if let Some((minimum, strict)) = edit.targets.minimum()
+                    && (number < minimum || (strict && number == minimum))
                 {
                     let (field, than) = (edit.targets.field, if strict { "above" } else { "at least" });
-                    let problem = format!("{value} would make a {field} of {number}; expected {than} {least}");
+                    let problem = format!("{value} would make a {field} of {number}; expected {than} {minimum}");
                     return Err(bounds.error(problem));
                 }
                 if let (ModelField::JointRange | ModelField::ActuatorForceRange, at) = target.place() {
@@ -172,8 +172,7 @@ impl ParameterEdit {
         }
     }
 
-    /// Returns the parameter's value for which an edit that sets a number writes `number`, or for which an edit that adds
-    /// a number adds `number`.
+    /// Returns the parameter's value for which this edit sets its targets to `number`, or adds `number` to them.
     fn value_from_number(&self, number: f64) -> f64 {
         if self.factor.abs() == 1.0 { number * self.factor } else { number / self.factor }
     }
@@ -193,7 +192,7 @@ impl ParameterEdit {
     }
 }
 
-/// Returns the value of version D: the file's `default`, otherwise the value in the model.
+/// Returns the value of version D: the file's `default`, otherwise the value that leaves the model unchanged.
 fn default(table: &TomlTable<'_>, model: &Model, edits: &[ParameterEdit]) -> Result<f64> {
     if let Some(default) = table.number("default")? {
         return Ok(default);
@@ -268,7 +267,7 @@ impl AppliedQuantity {
         let name = identifier(&name, name.text()?)?;
         let targets = Targets::new(table, model, elements, Change::Scale)?;
         if targets.field == "size" {
-            return Err(table.error("a size is no number; name a length or a radius"));
+            return Err(table.error("a size is not a number; name a length or a radius"));
         }
         let [target] = targets.all[..] else {
             let problem = format!("this names {} numbers; name one", targets.all.len());

@@ -80,7 +80,7 @@ impl Reading {
         Ok(Self { numbers: join(numbers), entries, scale, clip })
     }
 
-    /// The number of numbers that the reading has.
+    /// Returns the length of the list.
     pub(super) fn len(&self) -> usize {
         self.entries.len()
     }

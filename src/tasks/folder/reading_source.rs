@@ -274,8 +274,8 @@ impl Source<'_> {
             let length = self.model.index_array(Index::SensorDimension)[sensor] as usize;
             for i in 0..length {
                 let part = if length == 1 { String::new() } else { i.to_string() };
-                let suffix = if length == 1 { name.to_owned() } else { format!("{name}_{i}") };
-                let mut entry = entry(name, &part, suffix, "1");
+                let channel = if length == 1 { name.to_owned() } else { format!("{name}_{i}") };
+                let mut entry = entry(name, &part, channel, "1");
                 entry.kind = "sensor";
                 numbers.push((Number::Array(Array::Sensors, first + i, 1), entry));
             }

@@ -115,7 +115,7 @@ fn describe(
     )?;
     writeln!(
         out,
-        "  step          {} timesteps of {} s, at most {} steps an episode; poses of bodies are {}",
+        "  step          {} timesteps of {} s, at most {} steps per episode; poses of bodies are {}",
         task.frame_skip,
         model.timestep(),
         spec.step_limit,
@@ -133,8 +133,8 @@ fn describe(
     }
     let ends = match (task.healthy.len(), task.terminate_when_unhealthy) {
         (0, _) => "at the limit of steps",
-        (_, true) => "where it is not healthy, or at the limit of steps",
-        (_, false) => "at the limit of steps; where it is not healthy, terms of health change",
+        (_, true) => "when the robot is not healthy, or at the limit of steps",
+        (_, false) => "at the limit of steps; when the robot is not healthy, the terms `healthy` change",
     };
     writeln!(out, "  episodes end  {ends}")?;
     writeln!(out, "  success       {}", spec.success.description)?;
@@ -163,19 +163,19 @@ fn describe(
         )?;
     }
     for quantity in &task.applied {
-        writeln!(out, "  receipts have {} ({}), too", quantity.quantity.name, quantity.quantity.unit)?;
+        writeln!(out, "  receipts      also have {} ({})", quantity.quantity.name, quantity.quantity.unit)?;
     }
     if task.has_total_mass {
         writeln!(out, "  note          the model has settotalmass: an edited mass is not rescaled to that total")?;
     }
     writeln!(
         out,
-        "  memory        at most {} kB a thread for the simulation; {} kB of it for the model",
+        "  memory        at most {} kB per thread for the simulation; {} kB of it for the model",
         model.simulation_bytes() / 1000,
         model.model_bytes() / 1000
     )?;
     if let Some(Trial { steps_per_second, episodes, diverged }) = trial {
-        writeln!(out, "  speed         {steps_per_second:.0} steps a second on one core")?;
+        writeln!(out, "  speed         {steps_per_second:.0} steps per second on one core")?;
         if diverged > 0 {
             writeln!(
                 out,

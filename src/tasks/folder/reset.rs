@@ -132,7 +132,7 @@ impl Noise {
     fn new(table: &TomlTable<'_>) -> Result<Self> {
         table.only(NOISE)?;
         let (key, value) = table.one_of(&["uniform", "normal"])?;
-        let size = positive(&value)?;
+        let size = non_negative(&value)?;
         Ok(if key == "uniform" { Self::Uniform(size) } else { Self::Normal(size) })
     }
 
@@ -162,7 +162,7 @@ impl Placement {
         }
         match key {
             "uniform" | "normal" => Ok(Self::Noise(Noise::new(&table)?)),
-            "disc" if n == 2 => Ok(Self::Disc(positive(&value)?)),
+            "disc" if n == 2 => Ok(Self::Disc(non_negative(&value)?)),
             "disc" => Err(value.error(format_args!("a disc has two numbers, but these joints have {n}"))),
             _ => {
                 let sides = value.list()?.iter().map(Value::interval).collect::<Result<Vec<_>>>()?;
@@ -170,7 +170,7 @@ impl Placement {
                     let problem = format!("the box has {} sides, but these joints have {n} numbers", sides.len());
                     return Err(value.error(problem));
                 }
-                let beyond = table.get("beyond").map(|value| positive(&value)).transpose()?.unwrap_or(0.0);
+                let beyond = table.get("beyond").map(|value| non_negative(&value)).transpose()?.unwrap_or(0.0);
                 let farthest: f64 = sides.iter().map(|(low, high)| low.abs().max(high.abs())).map(|x| x * x).sum();
                 if farthest.sqrt() <= beyond {
                     return Err(table.error(format_args!("no point of the box is farther than {beyond} from 0")));
@@ -209,7 +209,7 @@ impl Placement {
     }
 }
 
-fn positive(value: &Value<'_>) -> Result<f64> {
+fn non_negative(value: &Value<'_>) -> Result<f64> {
     let size = value.number()?;
     if size >= 0.0 { Ok(size) } else { Err(value.error(format_args!("{size} is negative; expected 0 or more"))) }
 }
@@ -324,7 +324,7 @@ mod tests {
     }
 
     #[test]
-    fn discs_and_boxes_are_filled_and_kept_to() {
+    fn draws_fill_discs_and_stay_within_discs_and_boxes() {
         let mut stream = PhiloxStream::new(1, 2, DrawPurpose::InitialState, 3);
         let (mut state, mut largest) = ([0.0; 2], 0.0f64);
         for _ in 0..1000 {

@@ -67,7 +67,7 @@ enum TermKind {
         reading: Reading,
         sigma: f64,
     },
-    /// The mechanical power of actuators: (actuator, index of its joint in `qvel`).
+    /// The product |action × joint velocity| of each actuator: (actuator, index of its joint in `qvel`).
     Power(Vec<(usize, usize)>),
     /// The number of joints at a limit: (joint, index in `qpos`).
     Limits(Vec<(usize, usize)>),
@@ -93,12 +93,13 @@ pub(super) struct StepValues<'a> {
     pub(super) healthy: bool,
     /// The simulated time of a step, in s.
     pub(super) seconds: f64,
-    /// The numbers of the readings [`Term::remembered`] of all terms, after the previous step.
+    /// The numbers that terms need from the previous step, in the order of the terms. In the first step they are those
+    /// of the initial state. [`Term::remembered`] returns the reading by which a term reads its numbers.
     pub(super) before: &'a [f64],
 }
 
 impl Term {
-    /// Reads a term from its TOML table. `n_remembered` is the total of numbers that earlier terms remember.
+    /// Reads a term from its TOML table. `n_remembered` is the total number of values that earlier terms remember.
     pub(super) fn new(table: &TomlTable<'_>, model: &Model, elements: &Elements, n_remembered: usize) -> Result<Self> {
         let name = table.require("name", "\"forward\"")?;
         let name = identifier(&name, name.text()?)?;
@@ -137,7 +138,8 @@ impl Term {
                     None | Some(("linear", _)) => MarginShape::Linear,
                     Some(("gaussian", _)) => MarginShape::Gaussian,
                     Some((other, value)) => {
-                        let problem = format!("{:?} is no shape; expected \"linear\" or \"gaussian\"", escaped(other));
+                        let problem =
+                            format!("{:?} is not a shape; expected \"linear\" or \"gaussian\"", escaped(other));
                         return Err(value.error(problem));
                     }
                 };
@@ -215,10 +217,21 @@ impl Term {
         let sum = if self.mean { "mean" } else { "sum" };
         match &self.kind {
             TermKind::Value(_) => format!("{weight} × {sum} of {names}"),
-            TermKind::Rate(..) => format!("{weight} × change of {names} a second"),
+            TermKind::Rate(..) => format!("{weight} × change of {names} per second"),
             TermKind::Squared(_) => format!("{weight} × {sum} of squares of {names}{target}"),
             TermKind::Norm(_) => format!("{weight} × length of {names}{target}"),
-            TermKind::Within { low, high, .. } => format!("{weight} while {names} is within [{low}, {high}]"),
+            TermKind::Within { low, high, margin, shape, .. } => {
+                let outside = match shape {
+                    _ if *margin == 0.0 => String::new(),
+                    MarginShape::Linear => {
+                        format!(", decreasing linearly to 0 at a distance of {margin} from this range")
+                    }
+                    MarginShape::Gaussian => {
+                        format!(", decreasing as a Gaussian to a tenth at a distance of {margin} from this range")
+                    }
+                };
+                format!("{weight} while {names} is within [{low}, {high}]{outside}")
+            }
             TermKind::Near { sigma, .. } => format!("{weight} × exp(-|{names}{target}|² / {sigma}²)"),
             TermKind::Power(_) => format!("{weight} × {sum} of |action × joint velocity|"),
             TermKind::Limits(_) => format!("{weight} × {sum} of joints beyond 99 % of their range"),
@@ -391,6 +404,6 @@ pub(super) fn identifier<'a>(value: &Value<'_>, name: &'a str) -> Result<&'a str
     if starts && plain && name.len() <= MAX_CHARS {
         return Ok(name);
     }
-    let problem = "is no name; expected a letter, then letters, digits and underscores, at most 64 together";
+    let problem = "is not a valid name; expected a letter, then letters, digits and underscores, at most 64 characters";
     Err(value.error(format_args!("{:?} {problem}", escaped(name))))
 }

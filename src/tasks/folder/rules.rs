@@ -56,7 +56,7 @@ impl Range {
             );
         }
         match (low, high) {
-            (None, None) => Err(table.error("the range has no end; give above, below, from or to")),
+            (None, None) => Err(table.error("the range has no limit; give above, below, from or to")),
             (Some(low), Some(high)) if low >= high => {
                 Err(table.error(format_args!("no number lies between {low} and {high}; give the smaller one first")))
             }
@@ -115,9 +115,10 @@ impl Goal {
         let (comparison, threshold) = match (table.number("at_least")?, table.number("at_most")?) {
             (Some(threshold), None) => (SuccessComparison::AtLeast, threshold),
             (None, Some(threshold)) => (SuccessComparison::AtMost, threshold),
-            _ => return Err(table.error("give at_least or at_most: the number that the achieved one is compared with")),
+            _ => return Err(table.error("give at_least or at_most: the threshold for the achieved value")),
         };
-        // The key says what the rule compares: steps, steps at which ranges hold, or the best value of a reading.
+        // The key says what the rule compares: steps, steps at which ranges hold, or the greatest, least or last value
+        // of a reading.
         let ranges = |value: &Value<'_>| Range::list(&value.tables()?, model, elements);
         let mut goal = Self {
             achieved: None,
@@ -155,22 +156,22 @@ impl Goal {
                     name: leaked(&name),
                     unit: table.text("unit")?.map_or(entry.unit, |unit| leaked(unit)),
                 };
-                let best = match key {
+                let aggregate = match key {
                     "greatest" => Aggregate::Greatest,
                     "least" => Aggregate::Least,
                     _ => Aggregate::Last,
                 };
-                goal.achieved = Some((best, reading));
+                goal.achieved = Some((aggregate, reading));
                 Achievement::Own(quantity)
             }
         };
         // A number of steps has no unit, and must be possible within the step limit.
         if goal.achieved.is_none() {
             if let Some(unit) = table.get("unit").or_else(|| table.get("quantity")) {
-                return Err(unit.error("steps are counted here, which have neither unit nor quantity; leave it out"));
+                return Err(unit.error("this rule counts steps, so it takes neither unit nor quantity; leave it out"));
             }
             if !(1.0..=f64::from(step_limit)).contains(&threshold) || threshold.fract() != 0.0 {
-                return Err(table.error(format_args!("{threshold} is no number of steps within 1 … {step_limit}")));
+                return Err(table.error(format_args!("{threshold} is not a number of steps within 1 … {step_limit}")));
             }
         }
         Ok(goal)

@@ -227,7 +227,7 @@ impl<'a> Value<'a> {
         match self.numbers()?[..] {
             [low, high] if low <= high => Ok((low, high)),
             [low, high] => {
-                Err(self.error(format_args!("[{low}, {high}] is no interval: give the smaller number first")))
+                Err(self.error(format_args!("[{low}, {high}] is not an interval: give the smaller number first")))
             }
             ref other => Err(self.error(format_args!("expected an interval of two numbers, not {}", other.len()))),
         }

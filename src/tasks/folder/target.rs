@@ -123,7 +123,9 @@ impl Targets {
                         || refuse("has no capsule and no cylinder, so it has no length; use field = \"size\"");
                     all.push(length(model, id).ok_or_else(refused)?);
                 }
-                ("body", "size") if change != Change::Scale => return Err(refuse("has a size by = \"scale\" only")),
+                ("body", "size") if change != Change::Scale => {
+                    return Err(refuse("has a size that can only be scaled; use by = \"scale\""));
+                }
                 ("body", "size") => {
                     let refused = || refuse("has no geom of its own that could be scaled; use field = \"position\"");
                     all.push(size(model, id).ok_or_else(refused)?);
@@ -131,7 +133,7 @@ impl Targets {
                 ("body", _) if id == 0 => return Err(refuse("has no position")),
                 ("body", _) => all.push(Target::Position(id, axis(table, "position")?)),
                 ("geom", "radius") => {
-                    let refused = || refuse("is no sphere, capsule or cylinder, so it has no radius");
+                    let refused = || refuse("is not a sphere, capsule or cylinder, so it has no radius");
                     all.push(radius(model, id).ok_or_else(refused)?);
                 }
                 ("geom", _) => all.push(Target::Number(ModelField::GeomFriction, 3 * id + friction_column(field))),
@@ -149,13 +151,18 @@ impl Targets {
                 ("actuator", "forcerange") => all.push(range(table, ModelField::ActuatorForceRange, 2 * id, change)?),
                 ("actuator", "gear") => {
                     let is_zero = model.field(ModelField::ActuatorGear)[N_GEAR * id] == 0.0;
-                    all.push(if is_zero { Err(refuse("has a gear that begins with 0"))? } else { Target::Gear(id) });
+                    if is_zero {
+                        return Err(refuse("has a gear whose first number is 0"));
+                    }
+                    all.push(Target::Gear(id));
                 }
                 ("actuator", "kp") => {
-                    all.push(position_gain(model, id).ok_or_else(|| refuse("is no position servo, so it has no kp"))?);
+                    let refused = || refuse("is not a position servo, so it has no kp");
+                    all.push(position_gain(model, id).ok_or_else(refused)?);
                 }
                 ("actuator", _) => {
-                    all.push(velocity_gain(model, id).ok_or_else(|| refuse("is no velocity servo, so it has no kv"))?);
+                    let refused = || refuse("is not a velocity servo, so it has no kv");
+                    all.push(velocity_gain(model, id).ok_or_else(refused)?);
                 }
                 (_, "stiffness") => all.push(Target::Number(ModelField::TendonStiffness, id)),
                 _ => all.push(Target::Number(ModelField::TendonDamping, id)),
@@ -198,8 +205,9 @@ impl Targets {
     }
 
     /// Returns the minimum of the physically possible values of the targets, and whether the minimum itself is
-    /// excluded. `None` if there is no minimum. Masses must be positive, and most other values must not be negative.
-    pub(super) fn least(&self) -> Option<(f64, bool)> {
+    /// excluded. Returns `None` if there is no minimum. Masses, lengths, sizes and radii must be positive, and most
+    /// other values must not be negative.
+    pub(super) fn minimum(&self) -> Option<(f64, bool)> {
         match (self.subject, self.field) {
             ("body", "position") => None,
             ("body", _) | ("geom", "radius") => Some((0.0, true)),
@@ -215,7 +223,7 @@ fn axis(table: &TomlTable<'_>, of: &str) -> Result<usize> {
     let axis = table.get("axis").ok_or_else(|| table.error(format_args!("{of} has three axes; give axis = \"z\"")))?;
     let text = axis.text()?;
     let found = ["x", "y", "z"].iter().position(|&known| known == text);
-    found.ok_or_else(|| axis.error(format_args!("{:?} is no axis; expected x, y or z", escaped(text))))
+    found.ok_or_else(|| axis.error(format_args!("{:?} is not an axis; expected x, y or z", escaped(text))))
 }
 
 /// MuJoCo's number of the geom type `sphere`.
@@ -363,7 +371,8 @@ impl Target {
         }
     }
 
-    /// Sets the value in the model of a simulation. Before, the model must have the unedited value of `pristine`.
+    /// Sets the value in the model of a simulation. Numbers that change in proportion are computed from their values in
+    /// the unedited model `pristine`.
     pub(super) fn set(self, pristine: &Model, simulation: &mut Simulation, value: f64) {
         let (field, at) = self.place();
         let own = self.value(pristine);

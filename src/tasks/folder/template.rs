@@ -75,7 +75,8 @@ impl Template {
     /// Returns the edit for the parameters `values`, computed by this thread's simulation.
     ///
     /// # Errors
-    /// MuJoCo's fatal errors, and [`Error::Compile`] if the model cannot be compiled with these lengths.
+    /// MuJoCo's fatal errors, and [`Error::Compile`] if the model cannot be compiled with the lengths that `values`
+    /// give.
     pub(super) fn edit(&'static self, parameters: &[EditedParameter], values: &[f64]) -> Result<Arc<ModelEdit>, Error> {
         shared::with(self, |shared| {
             shared.edit(

@@ -20,11 +20,11 @@ use std::sync::OnceLock;
 /// | 3 … 5 | 0.3 × the torso's velocity along x, y, z in m/s |
 /// | 6, 7 | roll (0) and pitch of the torso, rad |
 /// | 8 … 19 | bthigh, bshin, bfoot, fthigh, fshin, ffoot: position, scaled so that the joint's range becomes ±1, and 0.1 × speed in rad/s |
-/// | 20 … 25 | whether ffoot, fshin, fthigh, bfoot, bshin, bthigh touched the floor in the previous step |
+/// | 20 … 25 | whether ffoot, fshin, fthigh, bfoot, bshin, bthigh touched the floor at the end of the previous step |
 ///
 /// Actions: the controls of the six motors. Each is clipped to ±1, and multiplied by `power` and by 120, 90, 60, 140,
 /// 60 or 30 N m. Reward: see [`Walker`]. Start: joint positions uniform in ±0.1 rad, clipped to the joints' ranges, at
-/// rest. The cheetah is alive while its pitch is within ±1 rad and no thigh or shin touches the floor.
+/// rest. The cheetah is alive while its pitch is within ±1 rad and the observed contacts of thighs and shins are 0.
 ///
 /// Source: Roboschool's `RoboschoolHalfCheetah-v1`, here simulated by MuJoCo.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {

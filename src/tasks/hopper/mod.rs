@@ -20,11 +20,11 @@ use std::sync::OnceLock;
 /// | 3 … 5 | 0.3 × the torso's velocity along x, y, z in m/s |
 /// | 6, 7 | roll (0) and pitch of the torso, rad |
 /// | 8 … 13 | thigh, leg, foot: position, scaled so that the joint's range becomes ±1, and 0.1 × speed in rad/s |
-/// | 14 | whether the foot touched the floor in the previous step |
+/// | 14 | whether the foot touched the floor at the end of the previous step |
 ///
 /// Actions: the controls of the three motors. Each is clipped to ±1, and multiplied by `power` and by 100 N m. Reward:
 /// see [`Walker`]. Start: joint positions uniform in ±0.1 rad, clipped to the joints' ranges, at rest. The hopper is
-/// alive while its torso is above 0.8 m and its pitch is within ±1 rad.
+/// alive while its torso's centre of mass is above 0.8 m and its pitch is within ±1 rad.
 ///
 /// Source: Roboschool's `RoboschoolHopper-v1`, here simulated by MuJoCo.
 pub static SPEC: EnvironmentSpec = EnvironmentSpec {

@@ -1,5 +1,6 @@
-//! The parts that the specifications of Hopper and HalfCheetah share: channels, reward terms, parameters and
-//! quantities.
+//! The parts that the specifications of Hopper and HalfCheetah share. These are the channels (the entries of
+//! observations, actions and states), the reward terms, the parameters, the quantities in receipts, the pushes and the
+//! success rule.
 
 use crate::env::{
     Achievement, ChannelSpec, ParameterSpec, PushSpec, QuantitySpec, RewardTermSpec, SuccessComparison, SuccessRuleSpec,
@@ -21,7 +22,7 @@ pub struct Names {
     /// The entries of an action.
     pub action: &'static [ChannelSpec],
     /// The entries of an exact state. The bounds of the entries are far beyond the values of any episode, and exclude
-    /// only numbers that would overflow.
+    /// only absurd numbers.
     pub state: &'static [ChannelSpec],
 }
 

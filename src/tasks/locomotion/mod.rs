@@ -1,8 +1,9 @@
 //! The task that Hopper and HalfCheetah share: Roboschool's running task (Brockman et al., 2016; Schulman et al.,
 //! 2017), simulated by MuJoCo 2.2.2.
 //!
-//! [`Walker`] implements the task. All environments of a thread share one simulation (`tasks/shared.rs`). Each robot's
-//! module has the robot's specification. The models are in `models/`, with the source of each number.
+//! [`Walker`] implements the task. All environments of the same robot that one thread runs share a simulation
+//! (`tasks/shared.rs`). Each robot's module has the robot's specification. The models are in `models/`, with the source
+//! of each number.
 
 pub(super) mod channels;
 pub(super) mod colours;
@@ -42,6 +43,6 @@ pub(super) struct Posture<'a> {
     pub height: f64,
     /// The rotation of the torso about the y axis, in rad.
     pub pitch: f64,
-    /// Whether each geom in [`Names::contacts`] touched anything in the previous step.
+    /// Whether each geom in [`Names::contacts`] touched anything at the end of the previous step.
     pub contacts: &'a [bool],
 }

@@ -52,7 +52,8 @@ impl RobotEdit {
                 coefficients[0] = friction;
             }
         }
-        // Computes the arrays that follow from masses: subtree masses, inverse weights, the scale of the solver.
+        // Computes the arrays that follow from masses: subtree masses, inverse weights, and the mean inertia, by which
+        // the solver scales its tolerance.
         simulation.set_const()?;
         let mut constants: Box<[f64]> = compiled_constants.into();
         simulation.constants(&mut constants);

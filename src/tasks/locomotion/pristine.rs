@@ -12,7 +12,7 @@ use std::{fmt::Write, sync::Arc};
 const TIMESTEP: f64 = 0.004125;
 /// Number of joints without motors, which come first: root_x, root_z, root_pitch.
 const N_ROOT: usize = 3;
-/// Maximal number of joints with motors. HalfCheetah has this many.
+/// Maximal number of joints with motors, and of geoms whose contacts are observed. HalfCheetah has this many of both.
 pub(super) const MAX_JOINTS: usize = 6;
 /// Maximal length of a robot's [state](Simulation::state).
 pub(super) const MAX_STATE: usize = 1 + 3 * (N_ROOT + MAX_JOINTS) + MAX_JOINTS;

@@ -58,7 +58,7 @@ fn a_fatal_error_ends_the_episode_of_one_robot_only() {
         assert!(!step(&mut lands).0);
         lands.reset_to(&[0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         assert!(step(&mut lands).0, "it touches the floor, which is fatal");
-        assert!(step(&mut lands).0, "until it is reset");
+        assert!(step(&mut lands).0, "it stays diverged until it is reset");
         assert_eq!(step(&mut next), (diverged, state));
         assert!(!diverged);
     }

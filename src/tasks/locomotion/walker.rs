@@ -31,9 +31,9 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 
 /// A robot in a vertical plane that is rewarded for running along +x.
 ///
-/// A step sets the controls to `power` × the action clipped to ±1, and simulates four timesteps of 4.125 ms. The
-/// observation has the contact flags of the previous step. These flags also decide whether the robot is alive. The
-/// reward is the sum of
+/// A step clips the action to ±1, sets the controls to `power` × this action, and simulates four timesteps of 4.125 ms.
+/// The observation has the contact flags of the state at the end of the previous step. In the first step of an episode
+/// all flags are false. The flags also decide whether the robot is alive. The reward is the sum of
 ///
 /// | term | value |
 /// |---|---|
@@ -45,9 +45,10 @@ const MAX_OBSERVATION: usize = N_TORSO + 2 * MAX_JOINTS + MAX_JOINTS;
 ///
 /// where a is the action as received, not clipped, and q̇ the joints' speeds after the step in rad/s.
 ///
-/// The physics diverge if MuJoCo raises a warning or a fatal error. Examples of warnings are a bad number and dropped
-/// contacts. After a divergence the episode terminates, the term `alive` is -1, the other terms are 0, and the
-/// observation of the previous step stays. If a reset sets a state that diverges at once, the observation is all zeros.
+/// The physics diverge if MuJoCo raises a warning or a fatal error, or if the observation is not finite. Examples of
+/// warnings are a bad number and dropped contacts. After a divergence the episode terminates, the term `alive` is -1,
+/// the other terms are 0, and the observation of the previous step stays. If a reset sets a state that diverges at
+/// once, the observation is all zeros.
 ///
 /// A walker has no simulation of its own. Before each step, the walker's parameters and state are written into a shared
 /// simulation. After the step, the walker stores the new state and the results.
@@ -243,7 +244,8 @@ impl Walker {
             .map(|cost| -cost.min(MAX_COST))
     }
 
-    /// Returns the transition of a step whose physics diverged.
+    /// Writes to `reward_terms` the terms of a step in which the physics diverged. Returns the transition that ends the
+    /// episode.
     fn fail(&mut self, reward_terms: &mut [f64]) -> Transition {
         self.diverged = true;
         reward_terms.copy_from_slice(&[-1.0, 0.0, 0.0, 0.0, 0.0]);

@@ -31,7 +31,8 @@ pub(super) fn drawing(position: f64) -> Drawing {
     drawing.line(&[[x, y], [x, y + 0.24]], 0.012, colour::DARK);
     drawing.polygon(&[[x, y + 0.24], [x + 0.1, y + 0.2], [x, y + 0.16]], colour::GREEN);
 
-    // Converts coordinates in the car's frame: x along the road, y perpendicular to it.
+    // Converts coordinates in the car's frame to coordinates in the picture. In the car's frame, x is along the road
+    // and y perpendicular to the road.
     let along = slope(position).atan();
     let at = |x: f64, y: f64| polar(polar([position, road(position)], x, along), y, along + FRAC_PI_2);
     let [half, height] = CAR;

@@ -5,8 +5,11 @@ use super::{MAX_TORQUE, UPRIGHT};
 use crate::scene::{Drawing, ScenePoint, colour, polar};
 use std::f64::consts::{FRAC_PI_2, PI};
 
+/// Width of the drawn rod, in m.
 const ROD: f64 = 0.16;
+/// Radius of the arrow that shows the torque, in m.
 const RADIUS: f64 = 0.36;
+/// Angle of the arrow for the maximal torque, in rad.
 const MAX_TURN: f64 = 0.75 * PI;
 /// Number of straight segments by which an arc is drawn.
 const SMOOTH: usize = 64;

@@ -66,8 +66,8 @@ const MAX_SPEED: f64 = 8.0;
 const MAX_TORQUE: f64 = 2.0;
 const STEP_LIMIT: u32 = 200;
 const MAX_INITIAL_ANGLE: f64 = 10_000.0;
-/// Maximal absolute angle in a snapshot, in rad. Angles are not wrapped, so this is the angle after an episode at
-/// maximal speed, rounded up.
+/// Maximal absolute angle in a snapshot, in rad. Angles are not wrapped, so this is the largest initial angle plus the
+/// turn of an episode at maximal speed, with one more step as a margin.
 const MAX_ANGLE: f64 = MAX_INITIAL_ANGLE + (STEP_LIMIT + 1) as f64 * MAX_SPEED * DT;
 const UPRIGHT: f64 = PI / 3.0;
 

@@ -225,7 +225,7 @@ async fn numbers_that_overflow_end_the_play_and_the_session_lives_on() {
     let huge = wire(&vec![f32::MAX; act.weights.len() / 4]);
     let (code, message) = session.refused(Act { weights: huge, ..act.clone() }).await;
     assert_eq!(code, Code::InvalidArgument);
-    assert!(message.starts_with("the policy's play has ended: the policy's output in environment 0"), "{message}");
+    assert!(message.starts_with("the server stopped playing the policy: the policy's output in env"), "{message}");
     let on = Act { task: Some(Task::Steps(5)), ..Act::default() };
     assert_eq!(session.refused(on).await.0, Code::FailedPrecondition);
     session.ask(Step { actions: vec![0; 20].into() }).await;

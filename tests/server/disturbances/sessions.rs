@@ -122,8 +122,8 @@ async fn a_session_without_disturbances_refuses_them_later() {
     let late = Reset { parameters: parameters(&[("action_delay", &[(2.0, 2.0)])]), ..Reset::default() };
     assert_eq!(
         refusal(session.refused(late.clone()).await),
-        "FailedPrecondition: Pendulum was opened without disturbances, so that \"action_delay\" cannot change; open it again \
-         with a disturbance, such as \"action_delay\" at its default\n"
+        "FailedPrecondition: Pendulum was opened without disturbances, so \"action_delay\" cannot change; open it \
+         again with a disturbance, such as \"action_delay\" at its default value\n"
     );
     let named = Open { parameters: parameters(&[("sensor_noise", &[(0.0, 0.0)])]), ..open("Pendulum", 1, 1) };
     let (mut named, _) = Session::open(server.unix(), named).await;
@@ -136,8 +136,8 @@ async fn a_session_without_disturbances_refuses_them_later() {
     let refused = refusal(Session::connect(server.unix()).await.refused(half).await);
     assert_eq!(
         refused,
-        "InvalidArgument: parameter \"action_delay\" of Pendulum takes whole numbers, and 0.5 has none; give such as 2 or \
-         0..4\n"
+        "InvalidArgument: parameter \"action_delay\" of Pendulum takes whole numbers, and 0.5 has none; give whole \
+         numbers, such as 2 or 0..4\n"
     );
 }
 

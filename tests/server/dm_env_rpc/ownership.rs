@@ -54,7 +54,7 @@ async fn world_is_changed_only_by_its_maker_and_its_agent() {
     maker.reset_world(&world, heavy()).await;
     for request in [reset_world(&world, heavy()), destroy(&world)] {
         let (code, message) = stranger.refused(request).await;
-        assert!(code == Code::PermissionDenied && message.contains("neither made world"), "{message}");
+        assert!(code == Code::PermissionDenied && message.contains("neither the maker nor the agent"), "{message}");
     }
     agent.leave().await;
     for request in [reset_world(&world, heavy()), destroy(&world)] {

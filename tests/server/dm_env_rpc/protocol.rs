@@ -327,7 +327,7 @@ async fn wrong_settings_of_a_world_are_refused_by_name() {
     assert_snapshot!(refusals);
     agent.create(settings("CartPole", [("seed", int64(i64::MAX)), ("mass", double(0.5))])).await;
     let full = agent.refused(create(settings("CartPole", []))).await;
-    assert_snapshot!(refusal(full), @"ResourceExhausted: 1 environments were asked for, but 1 of this server's 1 are in use; open fewer, or later");
+    assert_snapshot!(refusal(full), @"ResourceExhausted: 1 environments were asked for, but 1 of this server's 1 are in use; open fewer, or try again later");
 }
 
 #[tokio::test]

@@ -151,7 +151,7 @@ fn check_describes_all_eleven_without_a_warning() {
         let output = command.args(["--check", "--task"]).arg(folder.path()).output().unwrap();
         let (text, errors) = (String::from_utf8(output.stdout).unwrap(), String::from_utf8_lossy(&output.stderr));
         assert!(output.status.success(), "{name}: {errors}");
-        assert!(text.contains("observation") && text.contains("steps a second"), "{name}: {text}");
+        assert!(text.contains("observation") && text.contains("steps per second"), "{name}: {text}");
         assert!(!text.contains("warning"), "{name}: every parameter has an effect: {text}");
     }
 }

@@ -76,6 +76,8 @@ const WRONG: &[(&str, Spoil)] = &[
     ("URDF", |f| fs::write(f.join("cart.xml"), "<robot name=\"cart\"/>").unwrap()),
     ("no range of control", |f| replace(f, "cart.xml", " ctrllimited=\"true\" ctrlrange=\"-1 1\"", "")),
     ("no actuators", |f| replace(f, "cart.xml", "<actuator><motor name=\"push\" joint=\"rail\" gear=\"20\" ctrllimited=\"true\" ctrlrange=\"-1 1\"/></actuator>", "")),
+    ("many actuators", |f| replace(f, "cart.xml", "<actuator>", &format!("<actuator>{}", "<motor joint=\"rail\" ctrllimited=\"true\" ctrlrange=\"-1 1\"/>".repeat(2048)))),
+    ("name of a changed value", |f| replace(f, "task.toml", "extreme = [[0.2, 0.4], [0.6, 1.0]]", "extreme = [[0.2, 0.4], [0.6, 1.0]]\n[[applied]]\nname = \"changed_pole_mass\"\nbody = \"pole\"\nfield = \"mass\"")),
     ("include outside", |f| replace(f, "cart.xml", "<worldbody>", "<include file=\"/etc/passwd\"/><worldbody>")),
     ("include of a parent", |f| replace(f, "cart.xml", "<worldbody>", "<include file=\"../../etc/passwd\"/><worldbody>")),
     ("link outside", |f| { symlink("/etc/passwd", f.join("more.xml")).unwrap(); replace(f, "cart.xml", "<worldbody>", "<include file=\"more.xml\"/><worldbody>") }),
@@ -125,7 +127,8 @@ fn two_folders_of_one_name_are_refused() {
         server::command().args(["--check", "--task"]).arg(a.path()).arg("--task").arg(b.path()).output().unwrap();
     assert_eq!(output.status.code(), Some(2));
     let errors = String::from_utf8(output.stderr).unwrap();
-    assert!(errors.contains("\"cart_AndPole\" is that of an environment that this server has already"), "{errors}");
+    let words = "this server already has an environment \"CartAndPole\"; give \"cart_AndPole\" another name";
+    assert!(errors.contains(words), "{errors}");
 }
 
 #[test]

@@ -282,7 +282,7 @@ fn a_file_that_is_no_ledger_is_left_as_it_is() {
         std::fs::write(&path, text).unwrap();
         let refused = command().arg("--ledger").arg(&path).args(["--listen", "tcp://127.0.0.1:0"]).output().unwrap();
         let words = String::from_utf8(refused.stderr).unwrap();
-        assert!(words.contains("--ledger") && words.contains("no ledger"), "{words}");
+        assert!(words.contains("--ledger") && words.contains("not a ledger"), "{words}");
         assert_eq!((refused.status.code(), std::fs::read_to_string(&path).unwrap().as_str()), (Some(2), text));
     }
 }

@@ -96,7 +96,7 @@ async fn client_far_ahead_is_told_and_freed_by_a_new_file() {
     let mut session = session(&guarded, ANN, open("CartPole", 100, 1)).await;
     let (code, words) = session.refused(crate::common::server::step(vec![0; 400])).await;
     assert_eq!(code, Code::ResourceExhausted, "{words}");
-    assert!(words.contains("\"ann\" may take 1 steps a second") && words.contains(" s ahead"), "{words}");
+    assert!(words.contains("\"ann\" may take 1 steps per second") && words.contains(" s ahead"), "{words}");
     std::fs::write(&guarded.file, entry("ann", ANN, "")).unwrap();
     logged(&guarded.server, "read tokens again").await;
     timed(&mut session, 100, 3).await;

@@ -36,12 +36,12 @@ fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[cas
 #[case::only_ca(&["--tls-client-ca", "x"], "tls_cert is not given")]
 #[case::no_tokens(&["--tokens", "/nowhere/tokens"], "cannot read /nowhere/tokens")]
 #[case::no_files(&["--tls-cert", "/nowhere/cert", "--tls-key", "/nowhere/key"], "cannot read /nowhere/cert")]
-#[case::devices(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "expected a plain file")]
+#[case::devices(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "expected a regular file")]
 #[case::endless_tokens(&["--tokens", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::folder(&["--tokens", "/"], "it is a folder, expected a file")]
 #[case::endless_ledger(&["--ledger", "/dev/zero"], "that is not a regular file")]
 #[case::endless_config(&["--config", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
-#[case::decimal(&["--socket-mode", "438"], "no mode of a socket")]
+#[case::decimal(&["--socket-mode", "438"], "not a mode of a socket")]
 #[case::executable(&["--socket-mode", "0700"], "such as 0600")]
 fn a_wrong_guard_is_refused(#[case] flags: &[&str], #[case] part: &str) {
     let mut command = command();
@@ -79,7 +79,7 @@ fn a_pipe_is_refused_at_the_start_and_not_waited_for() {
         let mut command = command();
         command.args(["--listen", "tcp://127.0.0.1:0", flag]).arg(&pipe);
         let words = refused(command);
-        assert!(words.contains("plain file") || words.contains("regular file"), "{flag}: {words}");
+        assert!(words.contains("regular file"), "{flag}: {words}");
     }
 }
 

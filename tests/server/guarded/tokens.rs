@@ -54,7 +54,7 @@ async fn who_has_a_token_comes_in_and_others_do_not() {
 
     let stranger = connect(guarded.server.tcp(), &[]).await.unwrap();
     let words = unauthenticated(begin(&stranger, 1).await);
-    assert!(words.contains("asks for a token") && words.contains(TOKEN_FILE), "{words}");
+    assert!(words.contains("requires a token") && words.contains(TOKEN_FILE), "{words}");
     unauthenticated(within(stranger.catalogue()).await);
     let words = unauthenticated(begin(&guarded.connect(&ANN.to_uppercase()).await, 1).await);
     assert!(words.contains("does not know the token"), "{words}");

@@ -76,8 +76,8 @@ pub struct RunArgs {
     /// Write the events of each cell to this file as JSON lines. `-` or no name prints them.
     #[arg(long, value_name = "FILE", num_args = 0..=1, default_missing_value = "-", conflicts_with = "engine")]
     pub json: Option<PathBuf>,
-    /// Read one line with the names of cells from standard input, and run these cells. Stop when standard input is
-    /// closed.
+    /// Read one job, a JSON line with cells and a server number, from standard input, and run its cells. Stop when
+    /// standard input is closed.
     #[arg(long, hide = true, requires = "server",
         conflicts_with_all = ["cell", "jobs", "group", "engine", "retry_failed", "html", "done"])]
     pub worker: bool,

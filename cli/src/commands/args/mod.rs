@@ -73,9 +73,9 @@ impl Cli {
 pub enum CliCommand {
     /// List the environments with their parameters.
     Envs(EnvsArgs),
-    /// List the trainings and experiments in a folder with budget, result and state.
+    /// List the trainings, experiments and assessments in a folder with budget, result and state.
     Ls(LsArgs),
-    /// Show the trainings and experiments in a folder on a live web page.
+    /// Show the trainings, experiments and assessments in a folder on a live web page.
     Serve(ServeArgs),
     /// Train a policy.
     Train(Box<TrainArgs>),
@@ -170,7 +170,8 @@ pub struct PlayArgs {
     pub act: String,
 }
 
-/// A parser of one of a few names. Case, `-` and `_` are ignored. --help and shell completions list the names.
+/// A parser that accepts one of a few names. Case, `-` and `_` are ignored. --help and shell completions list the
+/// names.
 #[derive(Clone)]
 struct OneOf(Vec<&'static str>);
 

@@ -218,14 +218,15 @@ pub struct VideoArgs {
     /// Parameters that replace those of the version: a value, or intervals to draw from, e.g. length=0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
-    /// Number of episodes on each version. For a policy trained with RL² all episodes of a trial are shown.
+    /// Number of episodes on each version. With RL², each episode of a trial counts as one.
     #[arg(long, value_name = "N", default_value_t = 3, value_parser = at_least_one::<u64>)]
     pub episodes: u64,
     /// File to write. Its name ends in .gif, in .mp4, which needs ffmpeg, or in .png for a contact sheet: one picture
     /// with some moments of each episode in a row.
     #[arg(long, value_name = "FILE")]
     pub out: PathBuf,
-    /// Random seed. With the same seed, `evaluate --episodes 1` tests the first episode [default: the training's seed].
+    /// Random seed. With the same seed, `evaluate --episodes 1` tests the first episode (with RL², the last episode of
+    /// the first trial) [default: the training's seed].
     #[arg(long, value_name = "N", value_parser = natural::<u64>)]
     pub seed: Option<u64>,
     /// Width of the pictures, 240 to 2048 pixels [default: 480, in a contact sheet 240].

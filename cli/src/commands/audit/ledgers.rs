@@ -1,5 +1,5 @@
-//! `perturb audit --ledger`: proves with the servers' ledgers on which environments a policy was trained. A ledger is a
-//! server's log of everything that its sessions drew.
+//! `perturb audit --ledger`: proves with the servers' ledgers that a policy's training drew only from its stated set,
+//! and played no test episode. A ledger is a server's log of everything that its sessions drew.
 
 use std::io::Write;
 use std::process::ExitCode;
@@ -69,13 +69,13 @@ fn print(name: &str, proof: &Proof, records: &Records) -> std::io::Result<()> {
         .iter()
         .map(|token| token.as_ref().map_or("no token".into(), |token| format!("{token:?}")))
         .collect();
+    let tokens = tokens.join(" and ");
     let sets: Vec<&str> = records.about.tests.iter().map(|test| test.set.name.as_str()).collect();
     let sessions = if proof.sessions == 1 { "session" } else { "sessions" };
     writeln!(
         out,
-        "{name}: {} drew its training in {} {sessions}. Before the training's end it played no episode of the tests on {} \
-         and none of another test set",
-        tokens.join(" and "),
+        "{name}: the training was drawn with {tokens} in {} {sessions}. Before the training ended, no episode of the \
+         tests on {} was played with {tokens}, and none of a test set outside of the training's distribution",
         proof.sessions,
         sets.join(", ")
     )

@@ -33,7 +33,7 @@ pub(super) struct ChecksummedPolicy {
 /// Finds a results table, and the id of a policy's cell if `path` means a single policy.
 ///
 /// `path` is a table, a folder with a table, a policy file in the folder `policies` beside a table, or the name of such
-/// a policy. Returns `None` for any other path.
+/// a policy. Returns `None` for any other path, and for an experiment's folder even if it contains a table.
 pub(super) fn table_of(path: &Path) -> Result<Option<(PathBuf, Option<String>)>> {
     if path.join("plan.toml").is_file() {
         return Ok(None);

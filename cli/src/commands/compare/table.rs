@@ -105,6 +105,10 @@ fn check_options(args: &CompareArgs, has_tables: bool, has_others: bool) -> Resu
 /// Returns the success rule of the cells of `rows`; `None` if it is the environment's default rule. `rows` pairs each
 /// row with its table, because two tables may contain different studies of the same name. `names_sets` tells whether
 /// the user has named the sets to compare.
+///
+/// # Errors
+/// [`CommandError::Usage`] if the rules differ, or if the tables have different plans of one study and `names_sets` is
+/// false.
 fn success_rule(rows: &[(&ResultsTable, &TableRow)], names_sets: bool) -> Result<Option<String>> {
     let mut plans: Vec<(&str, &StudyPlan, Plan)> = Vec::new();
     let mut rules = BTreeSet::new();

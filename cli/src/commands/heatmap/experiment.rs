@@ -27,7 +27,7 @@ struct HeatmapCounts {
     total: usize,
     /// Number of heatmaps in `total` that could not be made.
     failed: usize,
-    /// Number of environments that lack the parameter of an axis.
+    /// Number of environments that are skipped because they lack the parameter of an axis, or have no default axes.
     skipped_environments: usize,
 }
 
@@ -46,8 +46,8 @@ pub(super) fn run(args: &HeatmapArgs, directory: &Path) -> Result<()> {
             directory.join("report")
         }
     };
-    // A `HeatmapPlace` is a heatmap of the experiment. It belongs to an environment, a method and a run, and shows the
-    // policy that was selected for them.
+    // A `HeatmapPlace` stands for the heatmaps of one policy: the policy that was selected for an environment, a
+    // method, a training set and a run.
     let results = Results::read(&plan, &folder)?;
     let selections = results.select();
     let places = heatmap_places(&selections);

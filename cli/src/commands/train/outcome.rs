@@ -41,7 +41,7 @@ pub(super) fn finish(
     }
     if let Some(number) = outcome.signal {
         note(format_args!(
-            "stopped by signal {number} after {} of {} episodes; go on with: {}",
+            "stopped by signal {number} after {} of {} episodes; resume it with: {}",
             outcome.progress.episodes,
             config.common.episodes,
             resume_command(directory.path(), &args.play)

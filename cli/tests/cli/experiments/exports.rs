@@ -16,7 +16,7 @@ fn run(arguments: &[&Path]) -> (Option<i32>, String) {
 
 #[test]
 fn a_run_is_exported_audited_and_continued_from_its_table() {
-    // Two very different learning rates make two short trainings give policies that act differently.
+    // The learning rates differ so much that two short trainings give policies that act differently.
     let experiment = Experiment::new(&PLAN.replace("7e-3", "0.1"));
     succeeded(&experiment.run("part", &["--cell", "0,2"]));
     let (part, file) = (experiment.out("part"), experiment.out("table/results.parquet"));
@@ -54,7 +54,7 @@ fn a_run_is_exported_audited_and_continued_from_its_table() {
     let (status, told) = run(&[path("audit"), &policy(0)]);
     assert!(status == Some(1) && told.contains("the episodes have the checksum"), "{told}");
 
-    // Another run with --done runs only the cells that the table does not have. Both together have all cells.
+    // Another run with --done runs only the cells that the table does not have. The two runs together have all cells.
     let done = file.to_str().expect("a path");
     let rest = experiment.run("rest", &["--done", done]);
     succeeded(&rest);

@@ -57,7 +57,7 @@ fn each_cell_of_a_group_ends_once() {
     assert_eq!(ends(&experiment, &servers, &all, &stop), expected);
     drop(lock);
 
-    // First a cell is stopped, then the server is lost, and then another server is started.
+    // First a signal stops both cells, then they lose their server, and then they run on another server.
     let left = [(1, None), (2, place(2).failure_id())];
     stop.raise(15);
     let stopped = CellEvent::Stopped { signal: 15 };

@@ -32,7 +32,8 @@ settings = { episodes_per_iteration = 20 }
 ";
 
 impl Experiment {
-    /// Returns the bytes of all results, records and stored policies.
+    /// Returns the bytes of all results, and of the records and checkpoint documents of the intermediate evaluations. A
+    /// document contains the checksum of the policy's weights.
     fn kept(&self, name: &str) -> BTreeMap<PathBuf, Vec<u8>> {
         let folder = ExperimentFolder::new(&self.out(name));
         let mut files = BTreeMap::new();
@@ -93,13 +94,13 @@ fn intermediate_evaluations_survive_kills() {
         assert_ne!(policies[0], policies[1]);
     }
 
-    let marks = || experiment.kept("killed").len();
+    let kept_files = || experiment.kept("killed").len();
     for least in [1, 4, 6] {
         let child = experiment.command("killed", &["--jobs", "1", "--group", "1"]).spawn().expect("started");
-        wait_for("a policy on the way", || marks() >= least);
+        wait_for("a policy on the way", || kept_files() >= least);
         kill_all(child);
     }
-    assert!(marks() < 15, "killed before the end");
+    assert!(kept_files() < 15, "killed before the end");
     succeeded(&experiment.run("killed", &["--jobs", "1", "--group", "1"]));
     assert!(experiment.kept("killed") == whole, "the same bytes, alone and together");
 
@@ -131,7 +132,7 @@ fn an_intermediate_policy_is_that_of_a_shorter_training() {
     assert_eq!(long.cell_result("out", 0).marks[&30].counters.episodes, 30, "reached exactly");
 }
 
-/// If the stored policy of an intermediate evaluation is deleted, the run makes it again.
+/// If the stored policy of an intermediate evaluation is deleted, the next run trains the cell again and stores it.
 #[test]
 fn a_training_without_its_intermediate_policies_restarts() {
     let experiment = Experiment::new(PLAN);

@@ -33,11 +33,11 @@ fn random_policies_are_tested_reported_and_replayed() {
     for result in &random {
         assert_eq!(result.training.counters.timesteps, 0);
         assert!(result.results.values().all(|test| test.episodes == 12));
-        assert_eq!(result.marks[&10].results, result.results, "it is the same at all times");
+        assert_eq!(result.marks[&10].results, result.results, "intermediate evaluations equal the final one");
         let first = random.iter().find(|first| first.training.environment == result.training.environment);
-        assert_eq!(result.results, first.unwrap().results, "it is the same whatever it would be trained on");
+        assert_eq!(result.results, first.unwrap().results, "results do not depend on the training version");
     }
-    // An untrained CartPole falls after some twenty steps.
+    // With random actions, CartPole's pole falls after some twenty steps.
     assert!((10.0..40.0).contains(&random[0].results["D"].mean_length), "{:?}", random[0].results);
 
     succeeded(&experiment.run("alone", &["--jobs", "1", "--group", "1"]));
@@ -51,7 +51,8 @@ fn random_policies_are_tested_reported_and_replayed() {
     succeeded(&output.expect("ended"));
 }
 
-/// A plan with a learner that observes parameters, a learner that does not, and the random policy.
+/// A plan with four cells: PPO that does not observe parameters, and PPO, RL²-PPO and the random policy that observe
+/// them.
 const SEEING: &str = "
 environments = ['Pendulum']
 versions = ['R']
@@ -78,7 +79,7 @@ architectures = ['ff']
 
 #[test]
 fn policies_that_observe_parameters_have_a_row_of_their_own() {
-    // The grid has the same setting as [settings] and takes precedence.
+    // The plan sets `observe` in its settings and in the grid of PPO. The grid takes precedence.
     let experiment = Experiment::new(SEEING);
     succeeded(&experiment.run("out", &["--jobs", "1"]));
     let results: Vec<_> = (0..4).map(|index| experiment.cell_result("out", index)).collect();

@@ -44,8 +44,8 @@ fn reports_do_not_depend_on_interruptions() {
 
     let page = String::from_utf8_lossy(&whole["page"]).into_owned();
     let whole_page = (page.matches("<svg").count(), page.matches("<table").count());
-    // Pictures: three findings, a profile, eight curves, four of parameters. Tables: three of metrics, two of
-    // scenarios, one of interquartile means.
+    // Pictures: three findings, a profile, eight curves, and four of success over parameters. Tables: three of metrics,
+    // two of scenarios, and one of interquartile means.
     assert_eq!(whole_page, (3 + 1 + 8 + 4, 3 + 2 + 1), "every picture and table");
     let pictures = ["profiles.png", "Pendulum-E-parameters.svg"];
     assert!(pictures.iter().all(|name| whole.contains_key(*name)), "{:?}", whole.keys());
@@ -261,7 +261,8 @@ fn heatmaps_of_an_experiment_are_made_once() {
     assert!(embedded(&without).is_empty());
     assert!(without.contains("not there: 8 of 8. <code>perturb heatmap DIR</code> makes them"));
 
-    // Two environments are trained on D and on E in two runs. The better of two configurations is selected.
+    // There are eight heatmaps, of policies that were trained in two environments on D and on E, in two runs. The
+    // better of two configurations is selected.
     assert_eq!(made(&experiment, &["--runs", "1"]), (4, 0));
     let partial = experiment.page("out");
     assert_eq!(embedded(&partial).len(), 2, "one of each environment");

@@ -141,7 +141,7 @@ fn two_simultaneous_retries_run_each_cell_once() {
         command.stdout(std::fs::File::create(told).expect("a file")).spawn().expect("started")
     };
     let runs: Vec<Child> = told.iter().map(run).collect();
-    // Both runs have seen the failures. Each has started a worker that found its cell locked.
+    // Wait until both runs have seen the failures, and each has started a worker that found its cell locked.
     let busy = |told: &PathBuf| std::fs::read_to_string(told).is_ok_and(|text| text.contains(r#""event":"busy""#));
     wait_for("two runs", || told.iter().all(busy));
     drop(held);
@@ -228,7 +228,7 @@ fn a_lost_server_is_no_cells_failure() {
 fn a_run_restarts_its_private_server_with_same_results() {
     let experiment = Experiment::new(&PLAN.replace("episodes = 40", "episodes = 1000, checkpoint_interval = 20"));
     succeeded(&experiment.run("undisturbed", &["--jobs", "2"]));
-    let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // the only server is in use
+    let child = experiment.command("out", &["--jobs", "1"]).spawn().expect("started"); // one job uses one server
     let cell = experiment.out("out/cells").join(&experiment.plan.cells[0].id);
     let checkpoint = || std::fs::read(cell.join("training/checkpoint/checkpoint.json")).ok();
     let mut killed = None;
@@ -391,5 +391,6 @@ fn plan_prints_counts_and_an_estimate() {
     let text = printed(&["plan", &file, "--measure", "1", "--timings-from", &out]);
     let from = format!("\nby the durations of 1 finished cell of the same environment and method in {out}: 4 cells, ");
     assert!(text.contains(&from) && text.contains("measured: 1 group for"), "{text}");
-    assert!(text.contains("until the step limit: 4 cells") && text.contains("\nunfinished there, 7 cells: "), "{text}");
+    let unfinished = format!("\nunfinished in {out}, 7 cells: ");
+    assert!(text.contains("until the step limit: 4 cells") && text.contains(&unfinished), "{text}");
 }

@@ -31,7 +31,7 @@ impl Experiment {
         self.plan.with_selected_cells(&ExperimentFolder::new(&self.out(name))).expect("readable").cells
     }
 
-    /// Returns the bytes of all results of these cells.
+    /// Returns the bytes of the result and the records of each finished cell.
     fn all_results(&self, name: &str) -> BTreeMap<String, [Vec<u8>; 2]> {
         let folder = ExperimentFolder::new(&self.out(name));
         let read = |id: &str, file: &str| std::fs::read(folder.cell(id).path().join(file)).ok();
@@ -91,7 +91,7 @@ fn reported_tests_share_nothing_with_selection_tests() {
     }
     assert!(
         selecting.is_disjoint(&reported) && selecting.len() == 2 && reported.len() == 6,
-        "of D and of R in each run"
+        "two selection seeds, and six seeds of reported tests"
     );
 
     let output = perturb(&["audit", "--all"]).arg(experiment.out("out")).output().expect("ended");
@@ -127,7 +127,7 @@ fn selected_cells_run_alone_and_both_rules_report() {
     };
     let clean = report(&[]);
     assert!(clean.contains("5 of 8 cells are done") && clean.contains("Selection: `clean`"), "{clean}");
-    assert!(clean.contains("on seed 1; those that are reported were trained anew on seeds 2 to 3"), "{clean}");
+    assert!(clean.contains("on seed 1; the reported configurations were trained anew on seeds 2 to 3"), "{clean}");
     let papers = report(&["--selection", "paper"]);
     assert!(papers.contains("4 of 4 cells are done") && papers.contains("Selection: `paper`"), "{papers}");
     let at = |name: &str| experiment.out("out/report").join(name).is_file();

@@ -9,7 +9,7 @@ use crate::common::{ended, wait_for};
 use crate::guarded::weights;
 use crate::patience::Named;
 
-/// A plan with two cells of some seconds, one after the other.
+/// A plan with two cells of some seconds.
 const PLAN: &str = "
 environments = ['CartPole', 'Pendulum']
 versions = ['E']

@@ -57,7 +57,7 @@ impl Cluster {
         let munged = ["--socket", "--key-file", "--pid-file", "--seed-file", "--log-file"]
             .map(|option| format!("{option}={}", file(&format!("munge{}", &option[1..]))))
             .map(|argument| argument.replace("munge-key-file", "key"));
-        // munged refuses folders that other users can write, such as temporary directories.
+        // Without --force, munged refuses folders that other users can write, such as temporary directories.
         cluster.daemon("munged", &[&["--foreground".to_owned(), "--force".to_owned()], &munged[..]].concat());
         let socket = path.join("munge-socket");
         wait_within(START_LIMIT, "munged", || socket.exists());
@@ -84,7 +84,7 @@ impl Cluster {
         self.directory.path().join("slurm.conf")
     }
 
-    /// Returns the indices of the jobs that run on a node, in their job array.
+    /// Returns the indices, within their job array, of the jobs that run on a node.
     pub fn running_on(&self, node: &str) -> Vec<usize> {
         let mut command = self.command("squeue");
         let output: Output =
@@ -104,7 +104,7 @@ impl Cluster {
         slurmd.wait().expect("ended");
         let name = format!("SLURMD_NODENAME=n{number}");
         let tasks: Vec<u32> = self.processes().into_iter().filter(|&id| environment(id).contains(&name)).collect();
-        assert!(!tasks.is_empty(), "node {number} had nothing to do");
+        assert!(!tasks.is_empty(), "node {number} ran no job");
         for &id in &tasks {
             let parent = parent(id);
             if fs::read_to_string(format!("/proc/{parent}/comm")).is_ok_and(|name| name.starts_with("slurmstepd")) {
@@ -181,7 +181,7 @@ fn kill(id: u32) {
     let _ = Command::new("kill").args(["-KILL", &id.to_string()]).stderr(Stdio::null()).status();
 }
 
-/// A minimal configuration that quickly notices a lost node and moves its jobs to another one.
+/// A minimal configuration, with which Slurm quickly notices a lost node and moves its jobs to another one.
 fn configuration(path: &Path) -> String {
     let output = |program: &str, argument: &str| {
         let output = Command::new(program).arg(argument).output().expect(program);

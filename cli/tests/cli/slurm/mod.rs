@@ -18,7 +18,8 @@ use tempfile::TempDir;
 use self::cluster::Cluster;
 use crate::common::{kill, perturb, stderr, wait_within};
 
-/// Environment variable. If it is set, the tests fail if Slurm is missing; otherwise they are skipped.
+/// Environment variable that decides about a missing Slurm. If it is set, the tests fail. If it is not set, they are
+/// skipped.
 const REQUIRED: &str = "PERTURB_SLURM_REQUIRED";
 /// Environment variable with the path of an experiment file to use in place of [`PLAN`], e.g. experiments/quick.toml.
 const PLAN_FILE: &str = "PERTURB_SLURM_PLAN";
@@ -199,8 +200,8 @@ fn interrupted_and_begun_again(experiment: &Experiment, cluster: &Cluster) -> Ch
     experiment.on(cluster, "slurm", &arguments).spawn().expect("started")
 }
 
-/// Waits until the training of a cell runs on node n1, and returns the cell's id. The training will not end before the
-/// node is killed.
+/// Waits until the training of a cell runs on node n1, and returns the cell's id. The training is in the first half of
+/// its episodes, so it will not end before the node is killed.
 fn in_mid_training_on_n1(experiment: &Experiment, cluster: &Cluster, run: &mut Child) -> String {
     let jobs = experiment.jobs("slurm");
     let in_work = |id: &String| {
@@ -267,7 +268,7 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
         if cell.id == victim {
             assert_eq!((begun, gone_on), (1, 1), "{}", cell.id);
         } else {
-            // Other trainings of the group may not have had a checkpoint, so they begin again.
+            // Other trainings of the moved job may begin or resume a second time.
             let most = 1 + usize::from(moved.contains(&cell.id));
             let logs = experiment.logs("slurm");
             assert!(
@@ -281,7 +282,7 @@ fn nothing_was_done_twice(experiment: &Experiment, victim: &str, moved: &[String
     }
 }
 
-/// Checks that Slurm's error messages are printed unchanged, and that no files are left.
+/// Checks that an error message of Slurm and the refusal of a wrong option are printed, and that no files are left.
 fn refusals(experiment: &Experiment, cluster: &Cluster) {
     for (option, value, words) in
         [("--partition", "nowhere", "invalid partition"), ("--array-limit", "0", "expected a whole number, at least 1")]
@@ -316,7 +317,8 @@ fn jobs_serve_the_task_folders_of_a_plan() {
     say("a plan over two tasks from folders has the same results on Slurm");
 }
 
-/// Checks a run whose jobs share a server on the remaining node. The run estimates the number of cells in a job.
+/// Checks a run whose job runs on the remaining node and uses the server given by --server. Without --cells-per-job,
+/// the run estimates the number of cells in a job.
 fn shared_server(experiment: &Experiment, cluster: &Cluster) {
     let server = PrivateServer::start(None).unwrap_or_else(|error| panic!("{error}"));
     let id = &experiment.plan.cells[0].id;

@@ -68,8 +68,8 @@ fn read_set(
     }
     let Some(file) = file else { return set_of(name, version, assignments) };
     let expected = "alone: the file's header names the parameters";
-    require(assignments.is_empty(), FILE, "beside parameters", expected)?;
-    let content = read_csv_file(file).map_err(|got| ValueError::new(FILE, got, "a CSV file beside the plan"))?;
+    require(assignments.is_empty(), FILE, "given in addition to parameters", expected)?;
+    let content = read_csv_file(file).map_err(|got| ValueError::new(FILE, got, "a CSV file in the plan's folder"))?;
     let set = set_of_csv(name, version, &content)?;
     csv_files.insert(file.clone(), content);
     Ok(set)

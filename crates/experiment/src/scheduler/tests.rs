@@ -9,7 +9,7 @@ use super::*;
 const PLAN: &str = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 2
     [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
 
-/// An action of an attempt in a script. Each action takes one simulated second.
+/// An action of an attempt in a script. `Wait` takes the given number of simulated seconds, every other action one.
 #[derive(Clone, Debug)]
 enum Act {
     Say(CellEvent),
@@ -48,9 +48,10 @@ fn done() -> Vec<Act> {
     vec![Succeeds, ends(CellEvent::Done)]
 }
 
-/// A backend that follows a script. `script` returns the actions for a cell and the number of the attempt at it, from
-/// 1.
-struct Fake<'a, const CONVICTS: bool> {
+/// A backend that follows a script. `script` gets a cell and the number of the attempt at the cell, from 1, and returns
+/// the actions of this attempt. With `RECORDS_CRASHES` the backend records crashes as failures and reports ends, as
+/// [`Local`] does. Otherwise it does neither, like jobs of a cluster.
+struct Fake<'a, const RECORDS_CRASHES: bool> {
     place: &'a Place,
     script: &'a dyn Fn(usize, usize) -> Vec<Act>,
     grouping: Grouping,
@@ -64,17 +65,17 @@ struct Fake<'a, const CONVICTS: bool> {
     most_at_a_time: usize,
 }
 
-impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
+impl<const RECORDS_CRASHES: bool> Backend for Fake<'_, RECORDS_CRASHES> {
     fn grouping(&self) -> Grouping {
         self.grouping
     }
 
     fn records_crashes_as_failures(&self) -> bool {
-        CONVICTS
+        RECORDS_CRASHES
     }
 
     fn reports_ends(&self) -> bool {
-        CONVICTS
+        RECORDS_CRASHES
     }
 
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>> {
@@ -107,7 +108,7 @@ impl<const CONVICTS: bool> Backend for Fake<'_, CONVICTS> {
         for group in groups {
             let mut running = Vec::new();
             for offer in group {
-                // A real worker also clears the failure.
+                // Clears the failure, as a real worker does.
                 if let Some(failure) = offer.retry {
                     self.place.folder.cell(self.place.id(offer.cell)).clear_failure_if(failure).unwrap();
                 }
@@ -207,17 +208,17 @@ impl Place {
         self.run_on::<true>(1, false, script)
     }
 
-    fn run_on<const CONVICTS: bool>(
+    fn run_on<const RECORDS_CRASHES: bool>(
         &self,
         jobs: usize,
         retry_failed: bool,
         script: &dyn Fn(usize, usize) -> Vec<Act>,
     ) -> Ran {
-        self.run_in::<CONVICTS>(Grouping { max_cells: 1, at_a_time: jobs }, retry_failed, script)
+        self.run_in::<RECORDS_CRASHES>(Grouping { max_cells: 1, at_a_time: jobs }, retry_failed, script)
     }
 
     /// Runs the plan to its end, in groups.
-    fn run_in<const CONVICTS: bool>(
+    fn run_in<const RECORDS_CRASHES: bool>(
         &self,
         grouping: Grouping,
         retry_failed: bool,
@@ -226,8 +227,17 @@ impl Place {
         let start = Instant::now();
         let (begun, groups, running) = (Vec::new(), Vec::new(), Vec::new());
         let (now, most_at_a_time) = (start, 0);
-        let mut fake =
-            Fake::<CONVICTS> { place: self, script, grouping, start, now, running, begun, groups, most_at_a_time };
+        let mut fake = Fake::<RECORDS_CRASHES> {
+            place: self,
+            script,
+            grouping,
+            start,
+            now,
+            running,
+            begun,
+            groups,
+            most_at_a_time,
+        };
         let (mut notes, mut statuses, mut told) = (Vec::new(), Vec::new(), Vec::new());
         let mut report = |report: ProgressEvent<'_>| match report {
             ProgressEvent::Status(status) => statuses.push(status.clone()),
@@ -303,7 +313,7 @@ fn server_waits_double_and_end() {
     // Each loss is reported one second after the start. The pauses are 1, 2, 4 and 8 s.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
     assert_eq!(ran.attempts(), [5, 0, 0, 0]);
-    assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "for their turns");
+    assert_eq!(ran.begun.iter().map(|(.., lost)| *lost).collect::<Vec<_>>(), [0, 1, 2, 3, 4], "the losses so far");
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
 }
 
@@ -339,11 +349,11 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
 #[case::had_one_for_a_minute(vec![server(), Wait(60), lost()], true)]
 #[case::had_one_for_less(vec![server(), Wait(50), lost()], false)]
 #[case::only_looked_for_one(vec![Wait(300), lost()], false)]
-fn what_is_lost_after_a_minute_is_not_lost_in_a_row(#[case] sixth: Vec<Act>, #[case] goes_on: bool) {
+fn a_loss_after_a_minute_with_a_server_is_counted_from_one(#[case] fifth: Vec<Act>, #[case] goes_on: bool) {
     let place = Place::new();
     let ran = place.run(&|_, attempt| match attempt {
         1..=4 => vec![lost()],
-        5 => sixth.clone(),
+        5 => fifth.clone(),
         6..=8 => vec![lost()],
         _ => done(),
     });
@@ -396,7 +406,7 @@ fn a_cell_that_others_work_on_is_waited_for_and_taken_over() {
 }
 
 #[test]
-fn what_others_did_is_not_done_again_and_seen_at_once() {
+fn results_of_other_runs_are_seen_at_once_and_not_repeated() {
     let place = Place::new();
     let script = |cell, _| {
         if cell == 0 {
@@ -411,7 +421,7 @@ fn what_others_did_is_not_done_again_and_seen_at_once() {
 }
 
 #[test]
-fn a_run_does_not_end_before_its_last_cell_is_told_to_be_done() {
+fn a_run_does_not_end_before_its_last_cell_is_reported_as_done() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![server(), Succeeds, Wait(5), ends(CellEvent::Done)]);
     assert_eq!(ran.end, place.finished(&[]));
@@ -419,7 +429,7 @@ fn a_run_does_not_end_before_its_last_cell_is_told_to_be_done() {
 }
 
 #[test]
-fn a_run_whose_jobs_do_not_tell_their_ends_sees_the_results() {
+fn a_run_whose_jobs_do_not_report_their_ends_sees_the_results() {
     let place = Place::new();
     let ran = place.run_on::<false>(4, false, &|_, _| vec![server(), Succeeds, Wait(9_000), ends(CellEvent::Done)]);
     assert_eq!(ran.end, place.finished(&[]));
@@ -447,7 +457,7 @@ fn cell_is_given_up_if_machines_may_be_faulty() {
 }
 
 #[test]
-fn a_cell_without_its_turn_is_not_to_blame() {
+fn handing_a_cell_back_is_no_failed_attempt() {
     let place = Place::new();
     let ran = place.run(&|cell, attempt| if cell == 0 && attempt < 9 { vec![Return] } else { done() });
     assert_eq!((ran.attempts(), ran.end), (vec![9, 1, 1, 1], place.finished(&[])));
@@ -503,7 +513,7 @@ fn what_is_left_is_grouped_anew() {
 }
 
 #[test]
-fn a_cell_that_kills_its_process_convicts_only_itself() {
+fn a_cell_that_kills_its_process_is_the_only_one_that_fails() {
     let place = Place::of(GROUPS);
     // No cell made progress, so it is unknown which cell killed the process.
     let script = |cell, attempt| if cell == 1 || (cell < 3 && attempt == 1) { vec![killed()] } else { done() };
@@ -574,7 +584,7 @@ fn cells_of_a_group_share_the_time_of_its_process() {
 
 #[test]
 fn test_episodes_are_counted_without_overflow() {
-    const MANY: f64 = i64::MAX as f64; // the most that TOML can say
+    const MANY: f64 = i64::MAX as f64; // the largest integer in TOML
     let plan =
         PLAN.replace("runs = 2", &format!("runs = 1\ntest_episodes = {}\ntest_versions = ['D', 'R', 'E']", i64::MAX));
     let plan = Plan::parse("test", plan).unwrap();

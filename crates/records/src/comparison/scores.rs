@@ -38,9 +38,9 @@ impl TestScores {
         }
     }
 
-    /// Returns the scores of a row of a results table. From the row's number of successes, the score of each episode
-    /// follows, except for the order of the episodes. Of returns and lengths, a row has only the means. Returns `None`
-    /// for a failed cell.
+    /// Returns the scores of a row of a results table. The row's number of successes gives the score of each episode,
+    /// but not the order of the episodes. Of returns and lengths, only the means are known. The result is `None` for a
+    /// failed cell.
     pub(super) fn of_row(row: &TableRow, score: ComparedScore) -> Option<Self> {
         let result = row.result()?;
         let (episodes, successes) = (usize::try_from(row.episodes?).ok()?, usize::try_from(row.successes?).ok()?);
@@ -56,8 +56,8 @@ impl TestScores {
     }
 }
 
-/// Returns whether all policies are known to have played the same episodes. Returns false if their addresses are
-/// unknown.
+/// Returns whether all policies are known to have played the same episodes. Returns false if there are several policies
+/// and the addresses of their episodes are unknown.
 pub(super) fn share_episodes(policies: &[TestScores]) -> bool {
     policies.windows(2).all(|two| !two[0].addresses.is_empty() && two[0].addresses == two[1].addresses)
 }

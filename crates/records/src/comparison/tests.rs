@@ -48,17 +48,18 @@ fn unequal_numbers_of_seeds_are_compared_without_pairs() {
     let it = &compared(&x, &y, ComparedScore::Return).differences[0];
     assert_eq!((it.paired, it.seeds, it.by_seed.len()), (false, [4, 3], 0));
     assert_eq!(it.difference, 2.5);
-    // The degrees of freedom are Welch's 4.03. The data are those of `p_values_are_those_of_the_textbook_tests`,
-    // shifted by 1.
+    // The degrees of freedom are Welch's 4.03.
     let [low, high] = it.seeds_95.unwrap();
     assert!((low + high - 5.0).abs() < 1e-9 && low < 0.0, "{low} {high}");
+    // The data of `p_values_are_those_of_the_textbook_tests`, shifted by 1.
     let x = [2, 3, 5, 8].map(|score| policy(&[score; 4]));
     let p = compared(&x, &y, ComparedScore::Return).differences[0].p.unwrap();
     assert!((p - 0.071_872).abs() < 1e-5, "{p}");
 }
 
 #[rstest]
-#[case(&[9], &[1], "x − y on D: +8.0 [+8.0, +8.0] over episodes: one seed of each says nothing of other seeds")]
+#[case(&[9], &[1], "x − y on D: +8.0 [+8.0, +8.0] over episodes: one seed each supports no conclusion about other \
+    seeds")]
 #[case(&[9, 5], &[1, 6], "x − y on D: +3.5, but +8.0 and -1.0 by seed: two seeds decide nothing")]
 #[case(&[9, 9], &[2, 1], "x − y on D: +7.5, +7.0 and +8.0 by seed: two seeds decide nothing")]
 #[case(&[9, 5, 5], &[1], "x − y on D: +5.3 [+5.3, +5.3] over episodes: 3 and 1 seeds decide nothing, at least 3 of each can")]
@@ -111,7 +112,7 @@ fn success_rates_have_wilsons_interval_over_episodes() {
 }
 
 #[test]
-fn other_episodes_are_compared_as_such() {
+fn policies_with_different_episodes_are_not_compared_by_episode() {
     let x = [policy(&[1, 2, 3, 4])];
     let mut other = policy(&[1, 2, 3, 4]);
     other.episodes.iter_mut().for_each(|episode| episode.seed = 8);
@@ -150,7 +151,7 @@ fn rows<'a>(name: &str, rows: &'a [TableRow]) -> TableCondition<'a> {
 }
 
 #[test]
-fn rows_of_a_table_give_the_numbers_of_episodes() {
+fn rows_of_a_table_give_the_same_numbers_as_episodes() {
     // Recorded episodes with the same numbers of successes as the rows. Each policy plays different episodes.
     let counts = [[30, 60, 90], [20, 40, 90]];
     let policy = |seed: u64, successes: u64| {

@@ -85,7 +85,7 @@ fn few_seeds_numbers(it: &ConditionDifference, score: ComparedScore) -> String {
 
 fn few_seeds(it: &ConditionDifference) -> String {
     match it.seeds {
-        [1, 1] => "one seed of each says nothing of other seeds".into(),
+        [1, 1] => "one seed each supports no conclusion about other seeds".into(),
         [2, 2] => "two seeds decide nothing".into(),
         [x, y] => format!("{x} and {y} seeds decide nothing, at least {MIN_RUNS_FOR_INTERVAL} of each can"),
     }

@@ -45,7 +45,7 @@ pub struct RecordsMetadata {
     pub parameters: Vec<RecordedParameter>,
     /// The names of the quantities that the server read back from the physics, in the order of the applied values.
     pub applied: Vec<String>,
-    /// The id of the checkpoint that was tested.
+    /// The id of the tested checkpoint. For a policy that is no checkpoint, a name such as "function upright".
     pub policy: String,
     /// The number of episodes in a trial of RL². Only the last episode of each trial is recorded. 1 for other policies.
     pub episodes_per_trial: u32,

@@ -25,13 +25,13 @@ pub enum RecordsError {
     Missing { path: PathBuf },
     /// The file is not a Parquet file.
     #[error(
-        "{} holds no recorded episodes: it is no Parquet file; give the --records of `perturb evaluate`, or a cell of \
-         `perturb run`",
+        "{} does not contain recorded episodes: it is not a Parquet file; give the --records of `perturb evaluate`, or \
+         a cell of `perturb run`",
         path.display()
     )]
     Other { path: PathBuf },
     /// The file is damaged, or another program wrote it.
-    #[error("{} does not hold recorded episodes: {reason}", path.display())]
+    #[error("{} does not contain recorded episodes: {reason}", path.display())]
     Damaged {
         path: PathBuf,
         /// A description of the fault.

@@ -123,11 +123,11 @@ fn a_file_of_something_else_is_refused() {
     for damaged in [&b"PAR1"[..], b"", &whole[..whole.len() / 2], &whole[1..]] {
         std::fs::write(&path, damaged).unwrap();
         let error = Records::read(&path).unwrap_err().to_string();
-        assert!(error.contains("does not hold recorded episodes"), "{error}");
+        assert!(error.contains("does not contain recorded episodes"), "{error}");
     }
     std::fs::write(&path, "environment = 'CartPole'").unwrap();
     let error = Records::read(&path).unwrap_err().to_string();
-    assert!(error.contains("it is no Parquet file"), "{error}");
+    assert!(error.contains("it is not a Parquet file"), "{error}");
 }
 
 #[test]

@@ -124,7 +124,7 @@ pub enum TableError {
     File(#[from] FileError),
     #[error("there is no results table {}: give a file that `perturb export` wrote", path.display())]
     Missing { path: PathBuf },
-    #[error("{} is no results table: {reason}; give a file that `perturb export` wrote", path.display())]
+    #[error("{} is not a results table: {reason}; give a file that `perturb export` wrote", path.display())]
     Damaged { path: PathBuf, reason: String },
     #[error(
         "{} has schema version {version}, this program reads 1 to {SCHEMA_VERSION}: use the version of perturb that \
@@ -158,7 +158,7 @@ impl ResultsTable {
         let Some(content) = read_if_exists(path)? else { return Ok(None) };
         let damaged = |reason: String| TableError::Damaged { path: path.to_owned(), reason };
         if content.is_empty() || ParquetFile::is_other(&content) {
-            return Err(damaged("it is no Parquet file".into()));
+            return Err(damaged("it is not a Parquet file".into()));
         }
         let file = ParquetFile::open(content).map_err(|error| damaged(error.to_string()))?;
         let not_understood = |error: serde_json::Error| damaged(format!("its metadata are not understood: {error}"));

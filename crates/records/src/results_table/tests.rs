@@ -115,12 +115,12 @@ fn columns_are_found_by_name_and_missing_ones_are_named() {
     assert_eq!(write(&columns, about).unwrap().rows(), table.rows(), "another order, and a column of a later program");
     columns.retain(|(name, _)| name != "seed");
     let message = write(&columns, about).unwrap_err().to_string();
-    assert!(message.contains("results.parquet is no results table: it has no column seed"), "{message}");
+    assert!(message.contains("results.parquet is not a results table: it has no column seed"), "{message}");
     let message = write(&table.columns(), r#"{"schema_version":2,"studies":{}}"#).unwrap_err().to_string();
     assert!(message.contains("has schema version 2, this program reads 1 to 1"), "{message}");
     std::fs::write(&path, "text").unwrap();
     let message = ResultsTable::read(&path).unwrap_err().to_string();
-    assert!(message.contains("it is no Parquet file"), "{message}");
+    assert!(message.contains("it is not a Parquet file"), "{message}");
     let message = ResultsTable::read(&directory.path().join("none")).unwrap_err().to_string();
     assert!(message.starts_with("there is no results table"), "{message}");
 }

@@ -1,8 +1,8 @@
 //! Statistics over runs: means, standard deviations, paired comparisons, and the aggregates with bootstrap intervals
 //! that Agarwal et al. (2021, arXiv:2108.13264) recommend.
 //!
-//! Runs are grouped in strata: a stratum holds the scores of all runs in one environment. All numbers equal those of
-//! the Python library rliable on the same data, which `rliable_tests.rs` checks.
+//! Runs are grouped in strata: a stratum holds the scores of all runs in one environment. The aggregates and their
+//! bootstrap agree with the Python library rliable on the same data, which `rliable_tests.rs` checks.
 
 mod aggregates;
 mod bootstrap;

@@ -104,8 +104,8 @@ impl<'a, DB: DrawingBackend> PlotCanvas<'a, DB> {
     /// Writes a line of text, vertically centred at the position.
     pub(super) fn text(&self, text: &str, at: CanvasPoint, side: TextAnchor) -> Result<(), PlotError> {
         let h = [HPos::Left, HPos::Center, HPos::Right][side as usize];
-        // plotters does not centre text exactly. The point of a text that it places at the position is the middle of
-        // the letters in an SVG, and a point above their middle in a PNG. All texts are moved down by one unit.
+        // plotters does not centre text exactly. In an SVG, it places the middle of the letters at the position, in a
+        // PNG a point above their middle. All texts are moved down by one unit.
         self.styled(text, font(self.scale).pos(Pos::new(h, VPos::Center)), (at.0, at.1 + 1.0))
     }
 

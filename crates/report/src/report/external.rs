@@ -34,7 +34,7 @@ pub(super) fn sentences(results: &Results<'_>, selections: &[MethodResults<'_>])
         let Some(episode) = policy.records.episodes.first() else { continue };
         let model = episode.model_hash.as_str();
         let (first, first_model) = *known.entry(name).or_insert((revision, model));
-        let others = "their numbers are of different environments.";
+        let others = "the numbers come from different environments.";
         if first != revision {
             lines.push(format!(
                 "{} was tested in revision {revision} of {name}, others in revision {first}: {others}",

@@ -20,7 +20,8 @@ impl<'a> Report<'a> {
         self.opening_rows().into_iter().map(|rows| self.finding_picture(rows)).collect()
     }
 
-    /// Returns a text of one or two sentences for each of the [`finding_pictures`](Self::finding_pictures).
+    /// Returns a text of one to three sentences for each of the [`finding_pictures`](Self::finding_pictures) in which
+    /// some method has Extrapolation.
     pub(super) fn finding_sentences(&self) -> Vec<String> {
         let rows = self.opening_rows().into_iter();
         rows.filter_map(|rows| Some(format!("{}: {}", self.finding_of(rows), finding_sentence(rows)?))).collect()
@@ -90,7 +91,7 @@ impl<'a> Report<'a> {
             groups: Metric::ALL.map(group).into(),
             legend: [
                 format!("mean over {over}"),
-                "95 % t interval of it".into(),
+                "its 95 % t interval".into(),
                 "the paper's mean, of five runs".into(),
             ],
             note: too_few(rows).unwrap_or_default(),
@@ -120,8 +121,8 @@ impl<'a> Report<'a> {
     }
 }
 
-/// Returns a sentence that names the method with the best Extrapolation and the next one, and compares Extrapolation
-/// with Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
+/// Returns sentences that name the method with the best Extrapolation and the next one, and compare Extrapolation with
+/// Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
 /// they share the first place and none is called best. If a method has a single run, no method is called best either,
 /// and the method's numbers are marked. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
@@ -136,7 +137,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     let numbers = format!("Extrapolation of {} and Default of {}", format_mean(extrapolation), format_mean(default));
     let zeros = zero_sentence(ranked.iter().filter(|(.., mean)| mean.point == 0.0).map(|(row, ..)| *row));
     if ranked.len() == 1 {
-        return Some(format!("{} comes to {numbers}.{zeros}", best.method));
+        return Some(format!("{} has {numbers}.{zeros}", best.method));
     }
     let written = |mean: &Bootstrapped| format!("{:.1}", mean.point);
     let number = written(&extrapolation);
@@ -165,9 +166,15 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     });
     let of = if ranked.len() < learned.len() { format!(" of {}", learned.len()) } else { String::new() };
     let differences: Vec<f64> = ranked.iter().map(|(_, default, mean)| rounded(mean.point - default.point)).collect();
-    let [least, most] = [f64::min, f64::max].map(|of| differences.iter().copied().reduce(of).unwrap_or_default());
+    let [least, most] =
+        [f64::min, f64::max].map(|of| format!("{:+.1}", differences.iter().copied().reduce(of).unwrap_or_default()));
+    let range = if least == most {
+        format!("is {least} points for each")
+    } else {
+        format!("ranges from {least} to {most} points")
+    };
     Some(format!(
-        "of {}{of} methods {found}{}. Extrapolation less Default is {least:+.1} to {most:+.1} points.{zeros}",
+        "of {}{of} methods {found}{}. Extrapolation minus Default {range}.{zeros}",
         ranked.len(),
         next.unwrap_or_default(),
     ))
@@ -178,13 +185,16 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
 fn zero_sentence<'a, 'm: 'a>(rows: impl Iterator<Item = &'a MethodMetrics<'m>>) -> String {
     let by = |row: &MethodMetrics<'_>| {
         let zeros: Vec<String> = row.zeros.iter().map(Scenario::to_string).collect();
-        format!("for {} {}", row.method, listed(&zeros))
+        format!("for {}, {}", row.method, listed(&zeros))
     };
     let methods: Vec<String> = rows.filter(|row| !row.zeros.is_empty()).map(by).collect();
     if methods.is_empty() {
         return String::new();
     }
-    format!(" Extrapolation is a geometric mean, and 0 in a run where one of its three is: {}.", methods.join(", "))
+    format!(
+        " Extrapolation is a geometric mean, and is 0 in a run in which any of its three success rates is 0: {}.",
+        methods.join("; ")
+    )
 }
 
 /// Formats a mean with its interval, e.g. "8.0 % [6.5, 9.0]". Adds "(1 run)" to the mean of a single run.
@@ -211,7 +221,7 @@ fn too_few(rows: &[MethodMetrics<'_>]) -> Option<String> {
     match without.len() {
         0 => None,
         some if some == all.len() => Some(format!("No intervals: too few seeds ({runs}).")),
-        _ => Some(format!("Where there is no interval: too few seeds ({runs}).")),
+        _ => Some(format!("Some numbers have no interval: too few seeds ({runs}).")),
     }
 }
 

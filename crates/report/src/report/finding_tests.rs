@@ -134,24 +134,28 @@ fn said_of_runs(rows: &[(&str, f64, f64, Option<[f64; 2]>)], runs: &[usize], mis
 
 #[rstest]
 #[case::nothing(&[], 1, None)]
-#[case::one(&[("a2c", 90.0, 30.25, None)], 0, Some("a2c ff (paper) comes to Extrapolation of 30.2 % and Default of 90.0 %."))]
+#[case::one(&[("a2c", 90.0, 30.25, None)], 0, Some(
+    "a2c ff (paper) has Extrapolation of 30.2 % and Default of 90.0 %."))]
 #[case::without_intervals_and_some_missing(&[("a2c", 0.0, 0.9, None), ("ppo", 90.0, 0.5, None)], 1, Some(
     "of 2 of 3 methods a2c ff (paper) generalises best, with Extrapolation of 0.9 % and Default of 0.0 %; next is ppo ff (paper), \
-     with Extrapolation of 0.5 %. Extrapolation less Default is -89.5 to +0.9 points."))]
+     with Extrapolation of 0.5 %. Extrapolation minus Default ranges from -89.5 to +0.9 points."))]
 #[case::apart(&[("ppo", 9.0, 5.0, Some([3.0, 6.0])), ("a2c", 9.0, 8.0, Some([6.5, 9.0]))], 0, Some(
     "of 2 methods a2c ff (paper) generalises best, with Extrapolation of 8.0 % [6.5, 9.0] and Default of 9.0 %; next is ppo ff \
-     (paper), with Extrapolation of 5.0 % [3.0, 6.0], and their intervals are apart. Extrapolation less Default is -4.0 to -1.0 points."))]
+     (paper), with Extrapolation of 5.0 % [3.0, 6.0], and their intervals are apart. Extrapolation minus Default \
+     ranges from -4.0 to -1.0 points."))]
 #[case::alike_and_random(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 8.0, Some([6.5, 9.0])), ("random", 1.0, 99.0, None)], 0,
     Some("of 2 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 % [6.0, 9.0] \
-     and 8.0 % [6.5, 9.0]. Extrapolation less Default is -1.0 to +0.0 points."))]
+     and 8.0 % [6.5, 9.0]. Extrapolation minus Default ranges from -1.0 to +0.0 points."))]
 #[case::overlapping(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 7.9, Some([6.5, 9.0]))], 0,
     Some("of 2 methods ppo ff (paper) generalises best, with Extrapolation of 8.0 % [6.0, 9.0] and Default of 9.0 %; next is a2c ff \
-     (paper), with Extrapolation of 7.9 % [6.5, 9.0], and their intervals overlap. Extrapolation less Default is -1.0 to -0.1 points."))]
+     (paper), with Extrapolation of 7.9 % [6.5, 9.0], and their intervals overlap. Extrapolation minus Default \
+     ranges from -1.0 to -0.1 points."))]
 #[case::written_alike_before_another(&[("ppo", 9.0, 8.04, None), ("a2c", 8.0, 7.96, None), ("late", 9.0, 1.0, None)], 0,
     Some("of 3 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 %; next is late \
-     ff (paper), with Extrapolation of 1.0 %. Extrapolation less Default is -8.0 to +0.0 points."))]
+     ff (paper), with Extrapolation of 1.0 %. Extrapolation minus Default ranges from -8.0 to +0.0 points."))]
 #[case::none_extrapolates(&[("ppo", 95.3, 0.0, None), ("a2c", 0.0, 0.04, None)], 1,
-    Some("of 2 of 3 methods none extrapolates: each has Extrapolation of 0.0 %. Extrapolation less Default is -95.3 to +0.0 points."))]
+    Some("of 2 of 3 methods none extrapolates: each has Extrapolation of 0.0 %. Extrapolation minus \
+     Default ranges from -95.3 to +0.0 points."))]
 fn the_finding_in_words(
     #[case] rows: &[(&str, f64, f64, Option<[f64; 2]>)],
     #[case] missing: usize,
@@ -161,18 +165,20 @@ fn the_finding_in_words(
 }
 
 #[rstest]
-#[case::one(&[("ppo", 90.0, 8.0)], &[1], "ppo ff (paper) comes to Extrapolation of 8.0 % (1 run) and Default of 90.0 % (1 run).")]
+#[case::one(&[("ppo", 90.0, 8.0)], &[1], "ppo ff (paper) has Extrapolation of 8.0 % (1 run) and \
+    Default of 90.0 % (1 run).")]
 #[case::the_first(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.0)], &[1, 3], "of 2 methods ppo ff (paper) comes out first, with \
     Extrapolation of 8.0 % (1 run) and Default of 9.0 % (1 run); next is a2c ff (paper), with Extrapolation of 5.0 %. \
-    Extrapolation less Default is -4.0 to -1.0 points.")]
+    Extrapolation minus Default ranges from -4.0 to -1.0 points.")]
 #[case::the_last(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.04), ("late", 9.0, 4.96)], &[3, 3, 1], "of 3 methods ppo ff (paper) comes \
     out first, with Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. \
-    Extrapolation less Default is -4.0 to -1.0 points.")]
+    Extrapolation minus Default ranges from -4.0 to -1.0 points.")]
 #[case::none(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 5.0)], &[2, 2], "of 2 methods ppo ff (paper) generalises best, with \
-    Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. Extrapolation less \
-    Default is -4.0 to -1.0 points.")]
+    Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. Extrapolation \
+    minus Default ranges from -4.0 to -1.0 points.")]
 #[case::alike(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 8.0)], &[3, 1], "of 2 methods none comes out first: ppo ff (paper) and a2c ff \
-    (paper) come to the same Extrapolation, 8.0 % and 8.0 % (1 run). Extrapolation less Default is -1.0 to -1.0 points.")]
+    (paper) come to the same Extrapolation, 8.0 % and 8.0 % (1 run). Extrapolation minus Default is -1.0 points for \
+    each.")]
 fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs: &[usize], #[case] said: &str) {
     let rows: Vec<_> =
         rows.iter().map(|&(name, default, extrapolation)| (name, default, extrapolation, None)).collect();
@@ -182,13 +188,13 @@ fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs
 /// Each case has PPO's rates on D, R and E in two rows: trained on D, and trained on R or E. All rates of A2C are 0.
 #[rstest]
 #[case::by_one([[90.0, 20.0, 0.0], [90.0, 60.0, 2.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
-    Extrapolation less Default is -90.0 to +0.0 points. Extrapolation is a geometric mean, and 0 in a run where one of its three \
-    is: for ppo ff (paper) DE.")]
+    Extrapolation minus Default ranges from -90.0 to +0.0 points. Extrapolation is a geometric mean, and is 0 in a run \
+    in which any of its three success rates is 0: for ppo ff (paper), DE.")]
 #[case::by_two([[90.0, 20.0, 0.0], [90.0, 60.0, 0.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
-    Extrapolation less Default is -90.0 to +0.0 points. Extrapolation is a geometric mean, and 0 in a run where one of its three \
-    is: for ppo ff (paper) DE and RE.")]
+    Extrapolation minus Default ranges from -90.0 to +0.0 points. Extrapolation is a geometric mean, and is 0 in a run \
+    in which any of its three success rates is 0: for ppo ff (paper), DE and RE.")]
 #[case::by_all([[90.0, 0.0, 0.0], [90.0, 60.0, 0.0]], "CartPole: of 2 methods none extrapolates: each has Extrapolation of 0.0 %. \
-    Extrapolation less Default is -90.0 to +0.0 points.")]
+    Extrapolation minus Default ranges from -90.0 to +0.0 points.")]
 fn zero_geometric_mean_is_explained(#[case] rates: [[f64; 3]; 2], #[case] said: &str) {
     let [on_d, on_r] = rates;
     let plan = plan("'CartPole'", 2);

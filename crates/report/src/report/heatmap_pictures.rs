@@ -262,8 +262,8 @@ impl HeatmapPictures {
         let waiting = self.missing.iter().filter(|why| **why == NoHeatmap::NoResult).count();
         let (makeable, all) = (self.missing.len() - waiting, self.total);
         let make = format!(
-            "Heatmaps that are not there: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
-             of these results; `--x`, `--y` and `--base-version` say over what."
+            "Missing heatmaps: {makeable} of {all}. `perturb heatmap DIR` makes them, where DIR is the folder \
+             of these results; `--x` and `--y` choose the parameters, `--base-version` the version of the others."
         );
         let wait = format!("Heatmaps that wait for the results of their trainings: {waiting} of {all}.");
         let notes = [(makeable, make), (waiting, wait)].into_iter().filter(|(count, _)| *count > 0);

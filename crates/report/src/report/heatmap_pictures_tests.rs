@@ -161,7 +161,7 @@ fn of_an_experiment_without_heatmaps_it_is_said_why() {
     let pictures = heatmap_pictures(&results.select(), Some(&folder)).unwrap();
     assert_eq!((pictures.pictures.len(), pictures.total), (0, 24));
     let advice = pictures.advice();
-    assert!(advice[0].starts_with("Heatmaps that are not there: 6 of 24."), "{advice:?}");
+    assert!(advice[0].starts_with("Missing heatmaps: 6 of 24."), "{advice:?}");
     assert_eq!(advice[1], "Heatmaps that wait for the results of their trainings: 18 of 24.");
 }
 

@@ -95,7 +95,7 @@ fn rule(plan: &Plan) -> String {
         ),
         Selection::Clean => format!(
             "Selection: `clean`. Configurations were selected by {} selection episodes of every training on {tuning}; \
-             those that are reported were trained anew on {}, and tested on other episodes.",
+             the reported configurations were trained anew on {}, and tested on other episodes.",
             plan.cells.iter().find_map(|cell| cell.tests.selection).unwrap_or_default(),
             seeds(plan.candidates.iter())
         ),
@@ -165,7 +165,7 @@ fn agreement(results: &Results<'_>, selections: &[MethodResults<'_>], checks: &[
 fn settings(plan: &Plan) -> String {
     let all = || plan.cells.iter().chain(&plan.candidates);
     let budget = |of: fn(&Cell) -> u64, papers: u64| match range(&plan.cells, of) {
-        budget if budget == papers.to_string() => format!("{budget} episodes (as the paper's)"),
+        budget if budget == papers.to_string() => format!("{budget} episodes (as in the paper)"),
         budget => format!("{budget} episodes (the paper's: {papers})"),
     };
     let rule = |cell: &Cell| match &cell.tests.success {

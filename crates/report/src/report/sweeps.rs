@@ -112,8 +112,9 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns a picture for each environment and training version, with a panel for each parameter. Leaves out
-    /// trainings and tests on the plan's own parameter sets.
+    /// Returns a picture for each environment and training version, and for policies of unknown training. A picture has
+    /// a panel for each parameter. Only tests on D, R and E are shown. Trainings on the plan's own parameter sets are
+    /// left out.
     pub(super) fn parameter_pictures(&self) -> Vec<Picture> {
         let is_of_version = |row: &&SweepPoint<'_>| Version::ALL.iter().any(|it| it.to_string() == row.tested_on);
         let all: Vec<_> = self.over_parameters.iter().filter(is_of_version).collect();
@@ -133,7 +134,7 @@ impl Report<'_> {
     /// Returns the picture of an environment and a training distribution. `rows` are all its points.
     fn parameter_picture(&self, environment: &str, trained_on: TrainedOn<'_>, rows: &[&SweepPoint<'_>]) -> Picture {
         let trained = match trained_on {
-            TrainedOn::Unknown => "whose training's parameters are not known".to_owned(),
+            TrainedOn::Unknown => "with an unknown training distribution".to_owned(),
             trained_on => format!("trained on {trained_on}"),
         };
         let parameters = distinct(rows.iter().map(|row| &row.parameter.name));
@@ -150,8 +151,8 @@ impl Report<'_> {
             name: format!("{environment}: success over each parameter, {trained}"),
             caption: format!(
                 "{environment}: success of policies {trained}, by the value that a parameter had in tests on R \
-                 (inside) and on E (outside), where the others are drawn, too. All runs together; bands are 95 % Wilson \
-                 intervals."
+                 (inside) and on E (outside), in which the other parameters are drawn as well. All runs together; \
+                 bands are 95 % Wilson intervals."
             ),
             data: panels.table(),
             drawing: PictureDrawing::Panels(panels),

@@ -138,7 +138,7 @@ fn clean_report_names_rule_seeds_and_selection() {
     let sentences = report.provenance.join("\n");
     for part in [
         "Selection: `clean`. Configurations were selected by 70 selection episodes of every training on seeds 1 to 2; \
-         those that are reported were trained anew on seeds 3 to 4, and tested on other episodes.",
+         the reported configurations were trained anew on seeds 3 to 4, and tested on other episodes.",
         "1 of 3 selections wait for tuning cells: CartPole ppo ff on E.",
         "1 of 3 selections have nothing to select, since all their tuning cells failed: CartPole ppo ff on R.",
         "1 of 3 selections are of configurations some of whose tuning cells failed: CartPole ppo ff on D (1 of 2 tuning \
@@ -157,7 +157,8 @@ fn clean_report_names_rule_seeds_and_selection() {
 #[rstest]
 #[case(
     "",
-    "Trainings of 15000 episodes (as the paper's) on D, R and E with the preset `perturb`; tests of 1000 episodes (as the paper's)"
+    "Trainings of 15000 episodes (as in the paper) on D, R and E with the preset `perturb`; tests of 1000 episodes (as \
+     in the paper)"
 )]
 #[case(
     "settings = { episodes = 300 }\ntest_episodes = 50",

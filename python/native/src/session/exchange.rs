@@ -73,8 +73,8 @@ impl PythonSession {
         Err(failure(UNUSABLE, 0, "another process opened the session"))
     }
 
-    /// Takes the open session for this thread, and marks it as busy. Fails if more than `max_under_way` steps were sent
-    /// and not yet received.
+    /// Takes the open session for this thread, and marks it as busy. Fails if more than `max_under_way` steps still
+    /// have unreceived replies.
     pub(super) fn take(&self, max_under_way: usize) -> PyResult<Box<OpenSession>> {
         self.require_own()?;
         let mut state = self.state();
@@ -134,9 +134,8 @@ impl PythonSession {
         self.exchange::<A>(py, open, None)
     }
 
-    /// Sends a request and receives its reply. `None` sends nothing, and receives the reply to the oldest step that was
-    /// sent and not received. If the server refuses the request, the session can be used further. All other errors end
-    /// the session.
+    /// Sends a request and receives its reply. `None` sends nothing, and receives the oldest reply to a step that was
+    /// sent. If the server refuses the request, the session can be used further. All other errors end the session.
     fn exchange<A>(
         &self,
         py: Python<'_>,

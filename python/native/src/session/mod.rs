@@ -78,9 +78,10 @@ struct LastStep {
     /// The last observations, float32 `[N, O]`. They complete the observations of a request that resets or restores
     /// only some environments.
     observations: Bytes,
-    /// Flags `[N]` of environments whose episode was terminated in the last step and that were not reset since; empty
-    /// if there are none. `truncated` has the flags of truncated episodes.
+    /// Flags `[N]` of environments whose episode was terminated in the last step and that were not reset or restored
+    /// since. Empty before the first step, and after a reset or restore of all environments.
     terminated: Bytes,
+    /// The flags for truncated episodes, like `terminated`.
     truncated: Bytes,
 }
 
@@ -155,8 +156,8 @@ impl PythonSession {
         }
     }
 
-    /// Returns the mask, bool `[N]`, of environments whose episode ended in the last step and that were not reset
-    /// since.
+    /// Returns the mask, bool `[N]`, of environments whose episode ended in the last step and that were not reset or
+    /// restored since.
     fn last_ended<'py>(&self, py: Python<'py>) -> Bound<'py, PyArray1<bool>> {
         let last = unpoisoned(&self.last);
         let mut ended = vec![false; self.actions.num_envs];
@@ -303,7 +304,7 @@ impl PythonSession {
         }
     }
 
-    /// Waits for the reply to the oldest step that was sent and not received, and returns its outcome.
+    /// Waits for the oldest reply to a step that was sent, and returns the outcome of the step.
     fn recv<'py>(&self, py: Python<'py>) -> PyResult<StepArrays<'py>> {
         let open = self.take(MAX_STEPS_UNDER_WAY)?;
         if open.under_way == 0 {
@@ -339,8 +340,8 @@ impl PythonSession {
         Ok((observations, Events::begun(&labels, done.started)?))
     }
 
-    /// Saves the environments that the mask selects, one snapshot each. Snapshots that are too long for one reply are
-    /// requested in several requests.
+    /// Saves the environments that the mask selects, one snapshot each. If the snapshots together are too long for one
+    /// reply, they are requested in several requests.
     fn snapshot<'py>(&self, py: Python<'py>, mask: &[u8]) -> PyResult<Vec<Bound<'py, PyBytes>>> {
         let length = self.snapshot_bytes.load(Ordering::Relaxed);
         let selected = self.selected(mask);
@@ -361,8 +362,8 @@ impl PythonSession {
     /// Restores snapshots into the environments that the mask selects. Returns the observations `[N, O]` of all
     /// environments. The rows of the other environments are their last observations.
     ///
-    /// Snapshots that are too long for one request are sent in several requests. If one of these requests is refused,
-    /// the snapshots of the earlier requests stay restored.
+    /// If the snapshots together are too long for one request, they are sent in several requests. If one of these
+    /// requests is refused, the snapshots of the earlier requests stay restored.
     fn restore<'py>(
         &self,
         py: Python<'py>,
@@ -415,8 +416,8 @@ impl PythonSession {
         if std::process::id() != self.owner {
             return;
         }
-        // Release Python's lock before locking the state. Otherwise this thread could hold the lock of the state and
-        // wait for Python's lock, while another thread holds Python's lock and waits for the lock of the state.
+        // Release the GIL before locking the state. Otherwise this thread could hold the lock of the state and wait for
+        // the GIL, while another thread holds the GIL and waits for the lock of the state.
         py.detach(|| {
             if let Ok(SessionState::Idle(open)) = self.state.try_lock().as_deref()
                 && !open.transport.is_embedded()

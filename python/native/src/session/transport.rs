@@ -89,7 +89,7 @@ impl Transport {
         matches!(self, Self::Embedded(_))
     }
 
-    /// Sends a request and receives its reply. `None` sends nothing, and receives the reply to the oldest step that
+    /// Sends a request and receives its reply. `None` sends nothing, and receives the oldest reply to a step that
     /// [`send`](Self::send) sent.
     pub(super) async fn exchange<A: TypedRequest>(
         stream: &mut Stream,

@@ -30,14 +30,15 @@ use std::sync::Arc;
 
 /// The price of `create_world`, in steps: the same as of an `open` of one environment in `perturb.v1`.
 const WORLD_PRICE: u64 = 17;
-/// The price of a reset, which begins a new trial, in steps.
+/// The price of `reset` and `reset_world`, in steps: the same as of a `reset` of one environment in `perturb.v1` that
+/// begins a new trial.
 const NEW_TRIAL_PRICE: u64 = 3;
 /// The maximum length of a request, bytes. Valid requests are far shorter, because a world has one environment. The
 /// limit is high so that a longer, invalid request still gets an error in-band.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
-/// The state of a client's stream. When it is dropped, its agent leaves the joined world, and the worlds that the
-/// stream made are freed unless they have an agent.
+/// The state of a client's stream. When it is dropped, the agent leaves the joined world, and the worlds made by the
+/// stream are freed unless they have another agent.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,
@@ -219,7 +220,8 @@ impl SessionHandler for Agent {
         response.map(|payload| Reply::new(rpc::EnvironmentResponse { payload: Some(payload) }))
     }
 
-    /// Returns `None`: a world's steps run on the calling thread, so pipelining would gain nothing.
+    /// Returns `None`: a world has one environment, whose steps mostly run on the calling thread. Pipelining would gain
+    /// little.
     fn pipeline(&self, _request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         None::<fn(Self::Request)>
     }

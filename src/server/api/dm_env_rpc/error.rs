@@ -65,8 +65,8 @@ pub enum Error {
     },
     /// The world belongs to another stream, and it is not shared.
     #[error(
-        "{request} came from a stream that has neither made world {world:?} nor is its agent; join it first, or have it \
-         made with the setting shared"
+        "{request} came from a stream that is neither the maker nor the agent of world {world:?}; join it first, or \
+         create it with the setting shared"
     )]
     NotYours {
         /// The name of the world.
@@ -75,13 +75,13 @@ pub enum Error {
         request: &'static str,
     },
     /// The requested name already belongs to another world.
-    #[error("a world {world:?} is there already; ask for another name, or for none")]
+    #[error("there already is a world {world:?}; choose another name, or none for a random name")]
     Taken {
         /// The requested name.
         world: String,
     },
     /// The property does not allow this access, e.g. a write.
-    #[error("property {key:?} cannot be {access}; list_property tells what each property allows")]
+    #[error("property {key:?} cannot be {access}; list_property says how each property may be accessed")]
     Forbidden {
         /// The key of the property.
         key: String,

@@ -1,5 +1,5 @@
-//! `dm_env_rpc.v1`, DeepMind's protocol, for the same environments. The protocol's worlds are single environments with
-//! names.
+//! `dm_env_rpc.v1`, DeepMind's protocol, for the same environments as `perturb.v1`. The protocol's worlds are single
+//! environments with names.
 //!
 //! - `service`: the gRPC service.
 //! - `agent`: the requests of one stream, and their legal order.

@@ -83,7 +83,7 @@ fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Proper
         Property::new("server_version", "the server's version", text(env!("CARGO_PKG_VERSION"))),
         Property::new(
             "environments",
-            "what env_id may be in create_world",
+            "the values of env_id that create_world accepts",
             tensors::tensor(Payload::Strings(StringArray { array: names }), &[n]),
         ),
     ];
@@ -102,16 +102,16 @@ fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&EpisodeRe
         new("env_id", spec.description, text(spec.name)),
         new("revision", "raised by every change of the environment", uint32(spec.revision)),
         new("model_hash", "SHA-256 of the MJCF or of a task folder's files; empty without a model", text(hash)),
-        new(VERSION, "D, R or E; writing it gives all parameters its sets", text(runner.version().to_string()))
+        new(VERSION, "D, R or E; a write sets the distributions of all parameters", text(runner.version().to_string()))
             .writable(),
         new(SEED, "fixes all randomness; writing it restarts the counts", uint64(runner.seed())).writable(),
         new("environment_index", "fixes randomness together with the seed", uint32(episode.environment_index)),
         new("trial_index", "counts trials from 0", uint64(episode.trial_index)),
         new("episode_index", "counts episodes from 0", uint64(episode.episode_index)),
         new("episodes_per_trial", "episodes with the same parameters", uint32(runner.episodes().episodes_per_trial)),
-        new("step_limit", "an episode is INTERRUPTED after so many steps", uint32(spec.step_limit)),
+        new("step_limit", "the number of steps after which an episode is INTERRUPTED", uint32(spec.step_limit)),
         new("control_timestep", "simulated seconds in a step", double(spec.control_timestep)),
-        Property::folder(PARAMETERS, "what was drawn or given for the episode; writing a parameter fixes it"),
+        Property::folder(PARAMETERS, "the values drawn or given for the episode; a write fixes a parameter"),
     ];
     let requested = receipt.map_or(&[][..], |receipt| &receipt.requested);
     for (parameter, value) in spec.parameters.iter().zip(requested) {
@@ -120,7 +120,7 @@ fn of_world(joined: &JoinedWorld, episode: EpisodeId, receipt: Option<&EpisodeRe
         property.range = Some((parameter.bounds.low, parameter.bounds.high));
         all.push(property.writable());
     }
-    all.push(Property::folder(APPLIED, "what was read back from the physics of the episode"));
+    all.push(Property::folder(APPLIED, "the values read back from the episode's physics"));
     let applied = receipt.map_or(&[][..], |receipt| &receipt.applied);
     for (quantity, value) in spec.applied.iter().zip(applied) {
         all.push(new(&format!("{APPLIED}.{}", quantity.name), quantity.unit, double(*value)));
@@ -132,7 +132,7 @@ fn find<'a>(properties: &'a [Property], key: &str) -> Result<&'a Property, Error
     properties.iter().find(|property| property.key == key).ok_or_else(|| Error::Unknown {
         what: "property",
         name: format!("{:?}", shorten(key)),
-        known: "list properties to see which there are; most are a world's, which must be joined".into(),
+        known: "list the properties to see their names; most belong to a world and need a joined world".into(),
     })
 }
 

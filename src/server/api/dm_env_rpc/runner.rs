@@ -126,8 +126,9 @@ impl Runner {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins the next episode. The first episode of a new world began with the world, so the first call only returns its
-    /// beginning. If there are changes, a new trial begins.
+    /// Begins the next episode, and returns its first observation. The first episode of a new world has already begun
+    /// with the world, so a first call without changes only returns that observation. If there are changes, a new trial
+    /// begins.
     ///
     /// # Errors
     /// If the token may not draw from the new distributions, the ledger cannot be written, or the server has a defect.
@@ -178,7 +179,8 @@ impl Runner {
 }
 
 /// Returns the protocol's state after a step. If the task ends an episode in the same step that interrupts it, the
-/// episode counts as terminated, as in Gymnasium, because its last state has no value.
+/// episode counts as terminated, because no reward can follow its last state. In Gymnasium, too, learners do not
+/// bootstrap from such a state.
 fn state(terminated: bool, interrupted: bool) -> State {
     match (terminated, interrupted) {
         (true, _) => State::Terminated,

@@ -100,7 +100,7 @@ impl Worlds {
         Caller { stream: registry.streams, bearer }
     }
 
-    /// Checks that no world has the requested name, if there is one.
+    /// Checks that the requested name is free. A request for a random name always passes.
     ///
     /// # Errors
     /// [`Error::Taken`], if a world of the same token has the name.
@@ -165,7 +165,7 @@ impl Worlds {
         Ok((Arc::clone(&entry.world), runner))
     }
 
-    /// Returns the runner of a world that the agent leaves.
+    /// Puts the runner of a world back into the registry, because the agent leaves the world.
     pub(super) fn leave(&self, agent: &Caller, world: &World, runner: Runner) {
         let mut registry = self.lock();
         if let Some(entry) = registry.worlds.get_mut(&agent.key(world.name())) {
@@ -232,7 +232,7 @@ fn random_name(environment: &str) -> Result<String, Error> {
 }
 
 fn unknown(name: &str) -> Error {
-    let known = "send the name that create_world returned; a world goes when it has neither an agent nor the stream \
-                 that made it";
+    let known = "send the name that create_world returned; a world is freed when it has neither an agent nor the \
+                 stream that made it";
     Error::Unknown { what: "world", name: format!("{:?}", shorten(name)), known: known.into() }
 }

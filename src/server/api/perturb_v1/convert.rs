@@ -79,7 +79,7 @@ fn check_no_single(request: &proto::Open) -> Result<(), Error> {
         ("open.episodes_per_trial", request.episodes_per_trial != 0),
     ];
     match given.into_iter().find(|(_, given)| *given) {
-        Some((field, _)) => Err(Error::value(field, "given beside open.groups", "it in each group alone")),
+        Some((field, _)) => Err(Error::value(field, "given in addition to open.groups", "it only inside each group")),
         None => Ok(()),
     }
 }
@@ -234,7 +234,7 @@ fn states(spec: &EnvironmentSpec, bytes: &Bytes, selected: usize) -> Result<Vec<
 pub fn release(size: usize, request: &proto::Release) -> Result<Vec<usize>, Error> {
     const FIELD: &str = "release.mask";
     let slots = mask(FIELD, size, &request.mask)?;
-    let expected = "at least one environment that goes and one that stays; end the stream to free all";
+    let expected = "at least one environment to free and one to keep; end the stream to free all";
     match slots.len() {
         0 => Err(Error::value(FIELD, "without a selected environment", expected)),
         all if all == size => Err(Error::value(FIELD, format!("all of the {size} environments"), expected)),

@@ -122,7 +122,7 @@ mod tests {
     use tonic::Code;
 
     #[test]
-    fn a_picture_of_nothing_names_its_slot() {
+    fn error_names_the_slot_that_cannot_be_drawn() {
         let nothing = Error::NothingToDraw { slot: 7 };
         assert_eq!(nothing.kind().code(), Code::FailedPrecondition);
         assert!(nothing.to_string().contains("slot 7"), "{nothing}");

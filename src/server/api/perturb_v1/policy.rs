@@ -185,8 +185,10 @@ fn weights(given: &Bytes, spec: &PolicySpec) -> Result<Vec<f32>, Error> {
     read_floats("weights", given).map_err(in_message("act"))
 }
 
-/// Converts the message `given` to a `T`. Returns `None` if it is absent, and an error about its field, prefixed with
-/// `field`, if it is invalid.
+/// Converts the message `given` to a `T`. Returns `None` if the message is absent.
+///
+/// # Errors
+/// If the message is invalid. The error names the wrong field, with the prefix `field`.
 fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     field: &'static str,
     given: &'a Option<M>,

@@ -56,8 +56,10 @@ pub struct Session {
     snapshot_bytes: usize,
     /// The memory reserved for the requests and replies of steps.
     step_memory: Option<MemoryReservation>,
-    /// The memory reserved for the current policy.
-    policy_memory: Option<MemoryReservation>,
+    /// The memory reserved for the current policy's weights.
+    weights_memory: Option<MemoryReservation>,
+    /// The memory reserved for the current policy's activations. New weights for the same policy leave it as it is.
+    activations_memory: Option<MemoryReservation>,
 }
 
 impl Session {
@@ -73,7 +75,8 @@ impl Session {
             budget,
             snapshot_bytes: 0,
             step_memory: None,
-            policy_memory: None,
+            weights_memory: None,
+            activations_memory: None,
         }
     }
 
@@ -86,7 +89,7 @@ impl Session {
             return Err(Error::value(
                 "open.lease",
                 unanswered,
-                format!("requests that wait at a time, 0 … {MAX_STORED_REPLIES}"),
+                format!("a number of unanswered requests, 0 … {MAX_STORED_REPLIES}"),
             ));
         }
         // Check the settings, and describe the environment as this session sees it.
@@ -148,7 +151,7 @@ impl Session {
         let batch = self.opened("step")?;
         convert::actions(batch.settings().spec, batch.size(), &request.actions)?;
         let stepped = batch.step(&request.actions).await?;
-        self.policy_memory = None;
+        self.forget_policy();
         Ok(reply(Response::Stepped(convert::stepped(stepped))))
     }
 
@@ -157,7 +160,7 @@ impl Session {
         let entries = convert::reset(batch, request)?;
         self.draws.reset(batch, &entries).await?;
         let (observations, started) = batch.reset(entries).await?;
-        self.policy_memory = None;
+        self.forget_policy();
         Ok(reply(Response::Reset(proto::ResetDone { observations, started: convert::started(started) })))
     }
 
@@ -184,7 +187,7 @@ impl Session {
                 return Err(error.into());
             }
         };
-        self.policy_memory = None;
+        self.forget_policy();
         Ok(reply(Response::Restore(proto::Restored { observations })))
     }
 
@@ -211,13 +214,20 @@ impl Session {
 
     async fn act(&mut self, request: proto::Act) -> Result<SessionReply, Error> {
         let batch = self.batch.as_mut().ok_or(Error::NotOpen { request: "act" })?;
-        let policy = sizes::policy(&request, batch.size());
-        let policy = (policy > 0).then(|| self.budget.reserve(policy)).transpose()?;
+        let reserve = |bytes: usize| (bytes > 0).then(|| self.budget.reserve(bytes)).transpose();
+        let weights_memory = reserve(sizes::weights(&request))?;
+        let activations_memory = reserve(sizes::activations(&request, batch.size()))?;
         let rollout = policy::rollout_request(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
         let reservation = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
-        self.policy_memory = policy.or(self.policy_memory.take());
+        self.weights_memory = weights_memory.or(self.weights_memory.take());
+        self.activations_memory = activations_memory.or(self.activations_memory.take());
         let acted = policy::rollout_response(batch.act(rollout).await?);
         Ok(Reply { memory: Some(reservation), ..reply(Response::Act(acted)) })
+    }
+
+    /// Frees the memory of the policy, because requests other than `act` discard it.
+    fn forget_policy(&mut self) {
+        (self.weights_memory, self.activations_memory) = (None, None);
     }
 
     fn save_player(&mut self) -> Result<SessionReply, Error> {
@@ -229,7 +239,7 @@ impl Session {
             return Err(Error::Order {
                 request: "resume",
                 when: "on a session that is open".into(),
-                advice: "send it on a stream of its own",
+                advice: "send it as the first request of a new stream",
             });
         }
         let proto::Resume { lease, last_reply } = request;
@@ -322,7 +332,8 @@ impl SessionHandler for Session {
         if let Some(batch) = self.batch.take() {
             batch.close().await;
         }
-        (self.env_quota, self.step_memory, self.policy_memory) = (None, None, None);
+        (self.env_quota, self.step_memory) = (None, None);
+        self.forget_policy();
     }
 
     async fn answer(&mut self, request: Self::Request) -> Result<SessionReply, Error> {

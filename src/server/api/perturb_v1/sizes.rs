@@ -1,4 +1,4 @@
-//! Upper bounds and estimates of the lengths of requests and replies. So many bytes are reserved in the memory budget
+//! Upper bounds and estimates of the lengths of requests and replies, by which memory is reserved in the budget
 //! beforehand.
 
 use crate::{
@@ -75,13 +75,17 @@ pub fn picture(size: Size) -> usize {
     3 * usize::from(size.width) * usize::from(size.height)
 }
 
-/// Returns the memory that the policy of an `act` takes while it plays `envs` environments, bytes: its weights as
-/// received and as loaded, and its activations in each environment.
-pub fn policy(request: &proto::Act, envs: usize) -> usize {
+/// Returns the memory that the new weights of an `act` take, bytes: as received and as loaded.
+pub fn weights(request: &proto::Act) -> usize {
+    2 * request.weights.len()
+}
+
+/// Returns the memory that the activations of the new policy of an `act` take in `envs` environments, bytes.
+pub fn activations(request: &proto::Act, envs: usize) -> usize {
     let widths = request.policy.as_ref().map_or(0, |policy| {
         policy.hidden.iter().chain([&policy.lstm]).map(|&width| width as usize).fold(0, usize::saturating_add)
     });
-    (2 * request.weights.len()).saturating_add(envs.saturating_mul(widths).saturating_mul(16))
+    envs.saturating_mul(widths).saturating_mul(16)
 }
 
 /// Returns an upper bound of the length of the reply to an `act`, bytes.

@@ -118,7 +118,7 @@ impl<'a> Jobs<'a> {
             if self.foreign.len() < MAX_FOREIGN_LINES && self.foreign.insert(line.clone()) {
                 let line = shortened(line);
                 self.pending_events
-                    .push(BackendEvent::Note(format!("squeue printed a line that is no job, ignored: {line}")));
+                    .push(BackendEvent::Note(format!("squeue printed a line that is not a job, ignored: {line}")));
             }
         }
         // If the folder was deleted and created again, older arrays may have the same names.

@@ -59,12 +59,12 @@ impl JobCommand {
 pub enum OptionError {
     /// The time limit has a format that Slurm does not accept.
     #[error(
-        "`{got}` is no time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
+        "`{got}` is not a time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
          DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
     )]
     Time { got: String },
     /// The number of cells per job is out of range.
-    #[error("{got} cells a job: expected 1 to {MAX_CELLS_PER_JOB}")]
+    #[error("{got} cells per job: expected 1 to {MAX_CELLS_PER_JOB}")]
     CellsPerJob { got: usize },
     /// The path has characters that are not allowed in a script or in Slurm's options.
     #[error("{path:?} cannot be handed to Slurm: {reason}; use another folder")]
@@ -176,7 +176,7 @@ mod tests {
             ["", "0", "00:00", "1h", "-5", "1-", "-", "1:2:3:4", "1-2:3:4:5", "1.5", "+5", " 5", "9999999", "1::2"]
         {
             let error = seconds(text).unwrap_err().to_string();
-            assert!(error.starts_with(&format!("`{text}` is no time limit: expected minutes")), "{error}");
+            assert!(error.starts_with(&format!("`{text}` is not a time limit: expected minutes")), "{error}");
         }
         assert_eq!("1-12:30".parse::<TimeLimit>().unwrap().text(), "1-12:30");
     }
