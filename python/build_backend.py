@@ -69,8 +69,8 @@ def find_server(clone: Path) -> str:
     named, built = os.environ.get("PERTURB_SERVER"), target / "release" / PROGRAM
     found = shutil.which(named) if named else shutil.which(built) or shutil.which(PROGRAM)
     if found is None:
-        where = f"PERTURB_SERVER={named} is no program" if named else f"{PROGRAM} is neither {built} nor on PATH"
-        raise FileNotFoundError(f"the package's environments are asked of {PROGRAM}, but {where}; {REMEDY}")
+        where = f"PERTURB_SERVER={named} is not a program" if named else f"{PROGRAM} is neither {built} nor on PATH"
+        raise FileNotFoundError(f"the package's environments are read from {PROGRAM}, but {where}; {REMEDY}")
     return found
 
 

@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--version", choices=["D", "R", "E"], default="D")
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    parser.add_argument("--server", help="unix:/path or host:port; by default a private server")
     arguments = parser.parse_args()
     torch.manual_seed(arguments.seed)
     torch.set_num_threads(1)

@@ -34,7 +34,7 @@ def main() -> None:
     """Write a picture file for each environment, with version D on the left and version E on the right."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("pictures"), help="the folder for the files")
-    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    parser.add_argument("--server", help="unix:/path or host:port; by default a private server")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     for name in CATALOGUE:

@@ -31,7 +31,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--version", choices=["D", "R", "E"], default="D")
-    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    parser.add_argument("--server", help="unix:/path or host:port; by default a private server")
     arguments = parser.parse_args()
     torch.set_num_threads(1)  # for networks this small, a second thread costs more time than it saves
 

@@ -15,7 +15,7 @@ import perturb  # noqa: F401  (registers the environments)
 def main() -> None:
     """Print the number of steps for which each pole stays up."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--server", help="unix:/path or host:port; at first a server of its own")
+    parser.add_argument("--server", help="unix:/path or host:port; by default a private server")
     lengths = np.array([0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 1.0, 2.0, 5.0])
     n = len(lengths)
 

@@ -1,4 +1,4 @@
-"""`evaluate` tests policies of all kinds in the episodes of `perturb evaluate`, and computes their statistics."""
+"""`perturb.evaluate` tests policies of all kinds on the same episodes as the command `perturb evaluate`."""
 
 from __future__ import annotations
 
@@ -354,7 +354,7 @@ class NoPolicy:
         ({"policy": lambda _: np.full(5, 9)}, perturb.InvalidArgumentError, "9"),
         ({"policy": {}}, perturb.InvalidArgumentError, "empty mapping"),
         ({"policy": {"x": upright}}, perturb.InvalidArgumentError, "'x' is none of"),
-        ({"policy": {"D": upright}, "trained_on": "D"}, perturb.InvalidArgumentError, "said by the keys"),
+        ({"policy": {"D": upright}, "trained_on": "D"}, perturb.InvalidArgumentError, "leave trained_on= out"),
         ({"environment": "Cart"}, perturb.InvalidArgumentError, "'Cart' is none of"),
         ({"versions": "DRE"}, perturb.InvalidArgumentError, "expected several"),
         ({"versions": ["x"]}, perturb.InvalidArgumentError, "'x' is none of"),

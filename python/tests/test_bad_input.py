@@ -75,10 +75,10 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
     [
         ({"environment": "CartPool"}, perturb.InvalidArgumentError, "did you mean 'CartPole'"),
         ({"version": "X"}, perturb.InvalidArgumentError, "'D'"),
-        ({"observe": "everything"}, perturb.InvalidArgumentError, "observe='everything' is none of 'state'"),
+        ({"observe": "everything"}, perturb.InvalidArgumentError, "observe='everything'; expected 'state'"),
         ({"observe": True}, perturb.InvalidArgumentError, "observe=True"),
         ({"server": "nowhere"}, perturb.InvalidArgumentError, "port is missing"),
-        ({"server": 7}, perturb.InvalidArgumentError, "no text"),
+        ({"server": 7}, perturb.InvalidArgumentError, "not a string"),
         ({"parameters": ["force"]}, perturb.InvalidArgumentError, "expected a dict"),
         ({"parameters": {"force": "strong"}}, perturb.InvalidArgumentError, "`strong`, but must be a value"),
         ({"parameters": {"force": "7,5"}}, perturb.InvalidArgumentError, "7.5 for one number, or `7, 5` for two"),
@@ -90,11 +90,11 @@ def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: 
             r"may be an interval or two values; write \(5, 9\)",
         ),
         ({"parameters": {"force": np.array([5, 9])}}, perturb.InvalidArgumentError, "may be an interval or two values"),
-        ({"max_episode_steps": 5, "forse": 1}, perturb.InvalidArgumentError, "max_episode_steps= is no setting"),
+        ({"max_episode_steps": 5, "forse": 1}, perturb.InvalidArgumentError, "max_episode_steps= is not a setting"),
         (
             {"versions": "R"},
             perturb.InvalidArgumentError,
-            r"versions= is no setting of environments \(did you mean version=",
+            r"versions= is not a setting of environments \(did you mean version=",
         ),
         ({"parameters": {"force": (1, 2, 3)}}, perturb.InvalidArgumentError, r"\(1, 2, 3\)"),
         ({"parameters": {"force": [(1, 2), 3]}}, perturb.InvalidArgumentError, "several intervals"),
@@ -144,7 +144,7 @@ def test_unknown_names_are_key_errors_with_a_plain_sentence(server: str) -> None
         ({"autoreset_mode": "Sometimes"}, "'SameStep'"),
         ({"first_environment_index": "first"}, "'first'"),
         ({"max_episode_steps": 50}, "the step limit of the server, 200"),
-        ({"daemon": True}, "daemon= is no setting of environments; there are"),
+        ({"daemon": True}, "daemon= is not a setting of environments; there are"),
     ],
 )
 def test_wrong_settings_of_a_batch_are_refused(settings: dict[str, Any], says: str, server: str) -> None:

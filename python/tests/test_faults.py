@@ -640,7 +640,7 @@ def test_a_limit_of_threads_is_reported(monkeypatch: pytest.MonkeyPatch, n_start
     monkeypatch.setattr(threading.Thread, "start", limited)
     running = sum(server.exit_status() is None for server in local_server._running)
     env = perturb.PerturbEnv("CartPole")
-    with pytest.raises(perturb.PerturbError, match=r"starts no further thread or process .*; raise the limit"):
+    with pytest.raises(perturb.PerturbError, match=r"cannot start another thread or process .*; raise the limit"):
         env.reset()
     assert sum(server.exit_status() is None for server in local_server._running) == running
     monkeypatch.setattr(threading.Thread, "start", start)

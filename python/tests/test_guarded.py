@@ -223,7 +223,7 @@ def test_a_server_with_an_invalid_certificate_is_refused(
         perturb.PerturbEnv("CartPole", server=address).reset()
 
 
-def test_plain_client_and_tls_server_are_told_apart(
+def test_an_address_with_the_wrong_scheme_is_refused_with_the_right_one(
     guarded: str, start: Callable[[Files], str], have: Callable[[Files], None]
 ) -> None:
     have(ALL)

@@ -57,9 +57,9 @@ def test_points_that_cannot_be_are_refused() -> None:
     assert len(perturb.sets.heatmap("Hopper").contexts or ()) == 100
     with pytest.raises(perturb.UnknownNameError, match="no parameter 'width'"):
         perturb.sets.heatmap("CartPole", "width")
-    with pytest.raises(perturb.InvalidArgumentError, match="force is an axis"):
+    with pytest.raises(perturb.InvalidArgumentError, match="force is given twice"):
         perturb.sets.heatmap("CartPole", "force", "force")
-    with pytest.raises(perturb.InvalidArgumentError, match="length is an axis"):
+    with pytest.raises(perturb.InvalidArgumentError, match="length is given twice"):
         perturb.sets.heatmap("CartPole", "length", "force", fixed={"length": 0.5})
     for points in (1, 101):
         with pytest.raises(perturb.InvalidArgumentError, match="points"):

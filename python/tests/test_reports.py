@@ -100,7 +100,7 @@ def test_audit_accepts_the_same_policy_and_finds_another(tmp_path: Path, server:
     with pytest.raises(perturb.InvalidArgumentError, match="expected one policy"):
         loaded.audit({"D": upright}, server=server)
     loaded = perturb.evaluate(perturb.load_policy(CART_POLE), "CartPole", episodes=5, server=server)
-    with pytest.raises(perturb.PolicyError, match=r"recorded of \d{8}-[0-9a-f]{8}, this is function upright: give"):
+    with pytest.raises(perturb.PolicyError, match=r"with \d{8}-[0-9a-f]{8}, but this policy is function upright: give"):
         loaded.audit({"D": upright}, server=server)
 
 

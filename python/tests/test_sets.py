@@ -203,7 +203,7 @@ def test_sets_with_contexts_can_be_trained_on(server: str) -> None:
         ({"contexts": grid}, "the environments take them from version='D'"),
         ({"contexts": grid, "version": "R", "parameters": {"mass": 0.1}}, "no parameters"),
         ({"contexts": perturb.sets.drawn("narrow", {"length": (0.3, 0.4)})}, "has no contexts"),
-        ({"contexts": LENGTHS, "num_envs": 2}, "there are 3 contexts for num_envs=2"),
+        ({"contexts": LENGTHS, "num_envs": 2}, "3 contexts need at least 3 environments; num_envs is 2"),
         ({"contexts": []}, "at least one"),
         ({"contexts": [{"length": (0.1, 0.2)}]}, "has intervals"),
         ({"contexts": {"length": 0.1}}, "expected a list"),

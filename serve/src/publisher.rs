@@ -220,7 +220,7 @@ impl Publisher {
         topics.retain(|topic, sender| {
             let has_subscribers = sender.receiver_count() > 0;
             if !has_subscribers && matches!(topic, Topic::Curves(_)) {
-                // Clears the cache at once, because clients can choose any number of combinations of trainings.
+                // Remove this entry of the cache immediately: clients can choose any number of combinations of trainings.
                 self.loaders.remove(topic);
             }
             has_subscribers

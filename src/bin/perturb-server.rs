@@ -325,7 +325,7 @@ async fn reload_on_hangup(mut hangups: tokio::signal::unix::Signal, reloader: Re
     }
 }
 
-/// Raises the limit of file descriptors to the hard limit, because each connection needs one.
+/// Raises the limit of file descriptors to the hard limit, because each connection needs a descriptor.
 fn raise_descriptors() {
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
@@ -351,8 +351,9 @@ fn health(config: &Config) -> Result<(), Failure> {
 /// immediately.
 ///
 /// Batch systems and the kernel warn of a limit by SIGUSR1, SIGUSR2 or SIGXCPU. The first warning also resolves the
-/// future, but does not count as one of the two signals that exit immediately. If `exit_with_stdin`, warnings are
-/// ignored: the program that started the server may get the same warning, and then needs the server to save its work.
+/// future. The server then exits immediately only at the second SIGTERM or SIGINT after the warning. If
+/// `exit_with_stdin`, warnings are ignored: the program that started the server may get the same warning, and then
+/// needs the server to save its work.
 fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (mut user_1, mut user_2) = (signal(SignalKind::user_defined1())?, signal(SignalKind::user_defined2())?);

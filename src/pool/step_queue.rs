@@ -15,8 +15,9 @@ pub struct StepQueue {
 }
 
 impl StepQueue {
-    /// Queues a step with these actions, if a step is running; otherwise does nothing. The caller must have checked the
-    /// actions, and must make this step the batch's next request.
+    /// Queues a step with these actions behind the running step. Does nothing if no step is running, if the step is
+    /// just ending, or if the session has not taken the result of the step before it. The caller must have checked the
+    /// actions. The batch's next request must be a step with these actions, even if nothing was queued.
     pub fn enqueue(&self, actions: Bytes) {
         // If the lock is taken, a worker is already finishing the running step, and it is too late to queue a step.
         if let Ok(mut pipelined) = self.job.pipelined.try_lock() {

@@ -58,7 +58,7 @@ impl EmbeddedServer {
     /// [`StartError`], if an environment or a thread cannot be made.
     pub fn start(catalogue: Catalogue) -> Result<Self, StartError> {
         let config = Config {
-            lease_seconds: 0, // no connection is lost
+            lease_seconds: 0, // there is no connection that could be lost
             ..Config::load(&Arguments { private: true, ..Arguments::default() })?
         };
         let context = ServerContext {

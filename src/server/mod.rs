@@ -5,7 +5,8 @@
 //!   files.
 //! - [`metrics`]: the page that Prometheus scrapes.
 //! - [`api`]: the two protocols; all validation of requests.
-//! - [`session`]: runs sessions of either protocol; leases, by which a session survives the loss of its connection.
+//! - [`session`]: runs sessions of either protocol, and manages the leases by which a session survives the loss of its
+//!   connection.
 //! - [`transport`]: reads messages from the network and sends replies, within a memory budget.
 //! - [`audit`]: checks from which distributions a token may draw, and records all draws in the ledger.
 //! - [`auth`]: tokens, with their quotas, rate limits and roles.

@@ -17,7 +17,7 @@ use std::{io, path::PathBuf};
 /// A server's tokens, TLS settings and ledger. The default has none of them.
 #[derive(Default)]
 pub struct Security {
-    /// The tokens; every call must carry one of them.
+    /// The tokens; every call over TCP must carry one of them, except health checks.
     pub tokens: Option<Tokens>,
     /// The TLS settings of TCP connections.
     pub tls: Option<Tls>,

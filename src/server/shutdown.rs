@@ -25,7 +25,7 @@ pub struct Drain {
 
 /// The controller of the shutdown: it sets the phase, and waits for sessions to end.
 pub struct Controller {
-    /// The sender of the phase to the handles of each transport thread.
+    /// The senders of the phase: one for the handle from `new`, and one for each handle from `view`.
     phases: Vec<watch::Sender<ShutdownPhase>>,
     sessions: watch::Sender<()>,
 }

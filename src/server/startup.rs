@@ -101,7 +101,7 @@ type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + 'a>>;
 /// first transport thread. Each further transport thread has a runtime of its own.
 ///
 /// # Errors
-/// [`Error`], if the server cannot start or a listener fails.
+/// [`Error`], if the server cannot start or a transport thread fails.
 pub fn run<'a>(
     listeners: Vec<Listener>,
     metrics: Option<Listener>,
@@ -149,7 +149,8 @@ async fn serve(
 
     let handshakes = Handshakes { limit: parts.handshake, tls: security.tls.clone() };
     let has_metrics = metrics.is_some();
-    let _metrics_server = metrics.map(|listener| answer_scrapers(listener, &sources)); // stops when this function returns
+    // The metrics server stops when this function returns.
+    let _metrics_server = metrics.map(|listener| answer_scrapers(listener, &sources));
     // Starts a gRPC server for each transport thread. The first server runs on this thread.
     let mut servers = JoinSet::new();
     let (threads, accepted) = TransportThreads::new(balance);
@@ -184,8 +185,8 @@ async fn serve(
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &security.ledger {
-        // The ledger records the last draws of a session when its environments are freed, so the ledger is closed after
-        // that.
+        // The ledger records the end of a session's draws when its environments are freed, so the ledger is closed
+        // after that.
         if timeout(CONNECTION_CLOSE_TIMEOUT, parts.pool.freed()).await.is_err() {
             tracing::warn!("the ledger ends before all environments are freed");
         }
@@ -298,7 +299,8 @@ impl ServerParts {
         dm_env_rpc::service::DmEnvRpcService::new(pool, catalogue, self.sessions.clone(), security.ledger.clone())
     }
 
-    /// The counters that the metrics read.
+    /// Collects the counters that the metrics read. Registers the protocols with the access log, so their counts of
+    /// ended sessions start at 0.
     fn sources(
         &self,
         requests: [RequestCounts; 2],
@@ -391,7 +393,7 @@ async fn watch_lag(sources: Option<Arc<MetricsSources>>, index: usize) {
     }
 }
 
-/// Accepts connections until the end of the shutdown.
+/// Accepts connections until the last phase of the shutdown.
 async fn accept(
     listener: Listener,
     limiter: PeerLimiter,
@@ -404,7 +406,7 @@ async fn accept(
     }
 }
 
-/// Waits for the end of the shutdown.
+/// Waits for the last phase of the shutdown, [`ShutdownPhase::Closed`].
 async fn closed(mut drain: Drain) {
     drain.closed().await;
 }

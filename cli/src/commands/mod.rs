@@ -51,7 +51,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 pub fn main() -> ExitCode {
     let _ = perturb_system::ignore_sigxfsz(); // if it fails, writing beyond `ulimit -f` ends the program
     let cli = Cli::from_process(|warning| {
-        // `perturb` has printed the warning before it replaced itself by perturb-recurrent.
+        // After `perturb` has replaced itself with perturb-recurrent, do not print the warning again.
         if !recurrent::is_replacement() {
             display::say(format_args!("perturb: {warning}"));
         }

@@ -152,7 +152,7 @@ fn all_cells(
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, errors) = Servers::connect_to_some(&addresses, stop)?;
     errors.iter().for_each(|error| say(format_args!("perturb: {error}; continuing with the other servers")));
-    step_limits(&servers, &plan)?;
+    let limits = step_limits(&servers, &plan)?.into_iter().map(|(name, limit)| (name.to_owned(), limit)).collect();
     check_models(&servers, &plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = |worker_index: usize| match local.len() {
@@ -173,7 +173,10 @@ fn all_cells(
     let server = || local.iter().find_map(restart);
     let mut runner = PlanRunner::begin(args, plan, folder, done, stop)?;
     while let Some(plan) = runner.next_round()? {
-        let bounds = if is_quiet() { Vec::new() } else { upper_bounds(args, &servers, &plan, folder, grouping, stop)? };
+        let bounds = match is_quiet() {
+            true => Vec::new(),
+            false => upper_bounds(args, &servers, &limits, &plan, folder, grouping, stop),
+        };
         runner.run(&plan, &mut Local::new(&plan, folder, grouping, &command, &server).with_max_seconds(bounds))?;
     }
     if stop.signal().is_some() {
@@ -193,15 +196,17 @@ fn unfinished_cells(args: &RunArgs, plan: &Plan, folder: &ExperimentFolder) -> V
 ///
 /// Here the kind of a cell is its environment and method. If cells of a kind begin at once, their durations will soon
 /// be known, and predict those of all other cells of the kind. Cells of such a kind have `None`. Cells of a kind with
-/// finished cells also have `None`. All others are measured. The result is empty if nothing was measured.
+/// finished cells also have `None`. All others are measured. The result is empty if nothing was measured. `step_limits`
+/// are those of the plan's environments. They were read before, because a server may be lost during the measurement.
 fn upper_bounds(
     args: &RunArgs,
     servers: &Servers,
+    step_limits: &HashMap<String, u32>,
     plan: &Plan,
     folder: &ExperimentFolder,
     grouping: Grouping,
     stop: &StopFlag,
-) -> Result<Vec<Option<f64>>> {
+) -> Vec<Option<f64>> {
     let kind = |cell: usize| (&plan.cells[cell].config.common.environment, plan.cells[cell].method());
     let unfinished = unfinished_cells(args, plan, folder);
     let groups = plan.groups(&unfinished, grouping);
@@ -211,26 +216,27 @@ fn upper_bounds(
     let is_unknown = |&cell: &usize| !first.contains(&kind(cell)) && timings.seconds(&plan.cells[cell]).is_none();
     let unknown: Vec<usize> = unfinished.into_iter().filter(is_unknown).collect();
     if unknown.is_empty() {
-        return Ok(Vec::new());
+        return Vec::new();
     }
     let groups = benchmark_cells(plan, &unknown, grouping);
     note(format_args!("measuring the duration of cells that begin later: {}", count(groups.len(), "group")));
     let measure = |group: Vec<&Cell>| measure(servers, &group, at_a_time, MEASURE_TIME, stop);
     let measured = match groups.into_iter().map(measure).collect::<Result<Vec<_>, _>>() {
         // A signal ended the measurement. The run, which begins next, will see the signal and stop.
-        Err(MeasureError::Stopped { .. }) => return Ok(Vec::new()),
+        Err(MeasureError::Stopped { .. }) => return Vec::new(),
         // A measurement can fail because settings lead to numbers that are not finite. The cell will report the error
         // when it runs.
         Err(error) => {
             tracing::warn!("the remaining time will be estimated late: {error}");
-            return Ok(Vec::new());
+            return Vec::new();
         }
         Ok(measured) => measured,
     };
-    let estimates = estimates(plan, &measured, &step_limits(servers, plan)?);
+    let limits = step_limits.iter().map(|(name, &limit)| (name.as_str(), limit)).collect();
+    let estimates = estimates(plan, &measured, &limits);
     let mut bounds = vec![None; plan.cells.len()];
     unknown.into_iter().for_each(|cell| bounds[cell] = Some(estimates[cell].seconds()));
-    Ok(bounds)
+    bounds
 }
 
 /// Returns the command of a worker process.

@@ -1,4 +1,5 @@
-//! Tasks from folders: trainings, tests, experiments and audits over private and named servers.
+//! Task folders: trainings, tests, experiments and audits on private servers, and the refusal of wrong folders and of
+//! changed or different models.
 
 use std::fs;
 use std::path::{Path, PathBuf};

@@ -402,7 +402,7 @@ fn broken_off(ending: &str, server: Option<&str>, end: impl FnOnce(u32)) -> (Out
 }
 
 #[test]
-fn a_server_killed_while_it_is_filmed_leaves_no_file() {
+fn a_film_whose_server_is_killed_leaves_no_file() {
     let server = server(1);
     let address = server.address().to_string();
     let (output, names) = broken_off("gif", Some(&address), |_| kill("-KILL", server.process_id()));

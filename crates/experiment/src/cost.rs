@@ -1,10 +1,10 @@
 //! Estimates the time that a plan takes, from short measurements.
 //!
 //! The model: the time of a step is the sum of the environment's time and the method's time. So each environment is
-//! measured with one method, and each method in one environment. Measured groups are as large as the groups of the real
-//! run. The speeds of the other pairs of environment and method are computed from these. The number of steps depends on
-//! what the policy learns, so only an upper bound is known beforehand. Durations of finished cells with the same
-//! environment and method are better estimates: see [`CellDurations`](crate::CellDurations).
+//! measured with one method, and each method in one environment. The speeds of the other pairs of environment and
+//! method are computed from the measured speeds. The number of steps depends on what the policy learns, so only an
+//! upper bound is known beforehand. Durations of finished cells with the same environment and method are better
+//! estimates: see [`CellDurations`](crate::CellDurations).
 
 use std::collections::HashMap;
 use std::iter::Sum;
@@ -13,8 +13,8 @@ use perturb_settings::{Method, TrainConfig, Wrapper};
 
 use crate::plan::{Cell, Grouping, Plan, distinct};
 
-/// Wall-clock seconds of one process per environment step, including the time of the policy. The steps of all cells
-/// that the process runs together count.
+/// Wall-clock seconds of one process per environment step, including the time of the policy. If the process runs
+/// several cells together, the steps of all these cells count.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Speed {
     /// Time per step in training, with rollouts and updates.
@@ -70,7 +70,8 @@ impl Sum for Estimate {
 
 /// Chooses groups of cells to measure before `cells` run. `cells` are indices in the plan. Each environment is measured
 /// with its first method, and each method in its first environment. A measured group is as large as a group of the run
-/// would be, and its cells are evenly spread over the grid. The cell in the middle of the grid comes first.
+/// would be, but only has cells of one environment and method. The cells are evenly spread over the grid, and the cell
+/// in the middle of the grid comes first.
 pub fn benchmark_cells<'a>(plan: &'a Plan, cells: &[usize], grouping: Grouping) -> Vec<Vec<&'a Cell>> {
     let groups = plan.groups(cells, grouping);
     let pair_at = |&cell: &usize| pair(&plan.cells[cell]);
@@ -137,8 +138,9 @@ pub fn tested_episodes(cell: &Cell) -> f64 {
     trials * f64::from(cell.config.settings.episodes_per_trial())
 }
 
-/// Returns the speed of a pair of environment and method. If the pair was not measured, adds the additional time of
-/// this environment to the method's time per step in another environment.
+/// Returns the speed of a pair of environment and method. If the pair was not measured, takes the method's time per
+/// step in another environment, and adds the time by which this environment is slower than the other one with another
+/// method. If only the environment or only the method was measured, returns that speed.
 fn speed_of((environment, method): &(&str, Method), measurements: &[Measurement]) -> Speed {
     let find = |environment: &str, method: &Method| {
         measurements.iter().find(|known| known.environment == environment && known.method == *method)

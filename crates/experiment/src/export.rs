@@ -26,9 +26,9 @@ pub enum ExportError {
 
 /// Returns the table rows of all done or failed cells in `folder`.
 ///
-/// The order is: cells of `plan` in the plan's order, then cells that were added by its selection, then done cells that
-/// are not in the plan, by id. Checks each result against its recorded episodes, if there are any. Calls `each` with a
-/// cell's id and the recorded episodes of its final policy.
+/// The order is: cells of `plan` in the plan's order, then its candidates, then done cells that are not in the plan, by
+/// id. Checks each result against its recorded episodes, if there are any. For each done cell with recorded episodes of
+/// its final policy, calls `each` with the cell's id and these episodes.
 ///
 /// # Errors
 /// [`ExportError`] if a file cannot be read, or a result contradicts its recorded episodes.
@@ -129,7 +129,7 @@ fn add_done(
     Ok(records)
 }
 
-/// Returns the row of a failed cell, in which the caller fills in the column `failure`.
+/// Returns the row of a failed cell, in which the caller fills in the columns `failure` and `commit`.
 fn failed_row(study: &str, cell: &Cell) -> TableRow {
     let common = &cell.config.common;
     let (trained_on, run) = (cell.trained_on().to_string(), (cell.run, common.seed));

@@ -9,11 +9,11 @@ use perturb_settings::ValueError;
 use crate::plan::Plan;
 use crate::selection::{MethodResults, Reported, SelectedRun};
 
-/// Judges the success of the assessed episodes again by the success rule of the plan's cells in the same environment.
-/// Returns the assessment unchanged if the plan has no cell in this environment.
+/// Judges the success of the assessed episodes again, by the success rule of the plan's first cell in the same
+/// environment. Returns the assessment unchanged if the plan has no cell in this environment.
 ///
 /// # Errors
-/// [`ValueError`] if the recorded episodes do not have what the rule needs.
+/// [`ValueError`] if the quantity that the rule compares was not recorded.
 pub fn judged_as_in(plan: &Plan, assessed: ExternalEvaluation) -> Result<ExternalEvaluation, ValueError> {
     let in_environment = |cell: &&crate::plan::Cell| cell.config.common.environment == assessed.environment();
     let Some(cell) = plan.cells.iter().find(in_environment) else { return Ok(assessed) };

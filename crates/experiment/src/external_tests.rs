@@ -15,7 +15,7 @@ fn external_agents_follow_their_environment_as_rows() {
     let mut selections = results.select();
     let assessed = [
         fixture::assessed("PPO", "CartPole", &[Some(D)], [200; 3]),
-        fixture::assessed("PPO", "CartPole", &[Some(R)], [200; 3]), // the same run, because no other assessment in it has R
+        fixture::assessed("PPO", "CartPole", &[Some(R)], [200; 3]), // the same run, because no assessment in it has R
         fixture::assessed("PPO", "CartPole", &[Some(D), Some(R)], [190; 3]),
         fixture::assessed("SAC", "Acrobot", &[None], [200; 3]),
     ];
@@ -43,7 +43,7 @@ fn external_agents_follow_their_environment_as_rows() {
 #[case("DR,RE", "DR,RE")]
 #[case("D,R", "DR")]
 #[case("D,DRE,R", "DR,DRE")]
-fn no_run_has_a_part_of_an_assessment(#[case] assessments: &str, #[case] expected: &str) {
+fn all_policies_of_an_assessment_are_in_one_run(#[case] assessments: &str, #[case] expected: &str) {
     let assessed = |letters: &str| {
         let trained_on = letters.chars().map(|letter| Some(letter.to_string().parse().unwrap()));
         fixture::assessed("PPO", "CartPole", &trained_on.collect::<Vec<Option<Version>>>(), [200; 3])

@@ -1,4 +1,4 @@
-//! Made-up results of cells for tests. It re-exports the test fixtures of `perturb-records`.
+//! Made-up results of cells for tests, and the test fixtures of `perturb-records`.
 #![allow(dead_code, unused_imports, reason = "each crate that includes it needs a part")]
 
 use perturb_checkpoint::Counters;

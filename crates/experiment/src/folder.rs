@@ -1,19 +1,22 @@
 //! Reads and writes the files in the folder of an experiment.
 //!
 //! ```text
-//! DIR/plan.toml              a copy of the experiment file
-//! DIR/cells/ID/result.json   the cell's result, written last
-//! DIR/cells/ID/failure.json  the reason why the cell failed
-//! DIR/cells/ID/timing.json   the duration of the cell, which differs from run to run
-//! DIR/cells/ID/training/     the output of `perturb train --out`; its subfolder marks/ has intermediate policies
-//! DIR/cells/ID/marks/        the recorded test episodes of intermediate policies
-//! DIR/cells/ID/log.txt       warnings of worker processes
-//! DIR/cells/ID/lock          locked while a process works on the cell
-//! DIR/heatmaps/              the output of `perturb heatmap DIR`
-//! DIR/report/                the output of `perturb report`
+//! DIR/plan.toml                   a copy of the experiment file
+//! DIR/NAME.csv                    copies of the CSV files that the experiment file names
+//! DIR/cells/ID/result.json        the cell's result, written last
+//! DIR/cells/ID/failure.json       the reason why the cell failed
+//! DIR/cells/ID/timing.json        the duration of the cell, which differs from run to run
+//! DIR/cells/ID/training/          the output of `perturb train --out`; its subfolder marks/ has intermediate policies
+//! DIR/cells/ID/episodes.parquet   the recorded test episodes of the final policy
+//! DIR/cells/ID/marks/             the recorded test episodes of intermediate policies
+//! DIR/cells/ID/log.txt            warnings of worker processes
+//! DIR/cells/ID/lock               locked while a process works on the cell
+//! DIR/heatmaps/                   the output of `perturb heatmap DIR`
+//! DIR/report/                     the output of `perturb report`
 //! ```
 //!
-//! Files are written atomically, so a file that exists is complete.
+//! All files except `log.txt` and the logs in `training/` are written atomically. So if such a file exists, it is
+//! complete.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -93,7 +96,8 @@ pub struct CellResult {
     pub agreement: Option<ParameterCheck>,
     /// The program's version and the commit that it was built from.
     pub commit: String,
-    /// Versions of other programs that did a part of the training before it was interrupted and resumed, in order.
+    /// Other versions of the program that did a part of the training before it was interrupted and resumed, in order.
+    /// Each has the form of `commit`.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub earlier_commits: Vec<String>,
     /// The shell command that reproduces the result without the plan.
@@ -123,7 +127,7 @@ pub struct Training {
     /// SHA-256 in hexadecimal of the model's MJCF text, or of all files of the task folder that the server read. Empty
     /// for an environment without a model.
     pub model_hash: String,
-    /// The version that all parameters without an entry in the settings are drawn from.
+    /// The version that all parameters are drawn from, except those in the table `parameters` of `settings`.
     pub version: Version,
     /// The name of the plan's parameter set that the policy was trained on; `None` if it was trained on a version.
     #[serde(default, skip_serializing_if = "Option::is_none")]
@@ -159,7 +163,7 @@ pub struct FailureRecord {
     pub requires_restart: bool,
 }
 
-/// The default for files of earlier programs, which do not have the field.
+/// The default of [`FailureRecord::requires_restart`], for files of earlier programs without this field.
 fn yes() -> bool {
     true
 }
@@ -259,7 +263,7 @@ impl ExperimentFolder {
     /// different experiment file.
     ///
     /// # Errors
-    /// [`FileError`] if a file cannot be written.
+    /// [`FileError`] if a file cannot be read or written.
     pub fn store_plan(&self, plan: &Plan) -> files::Result<bool> {
         let earlier = files::read_if_exists(&self.plan_path())?;
         let same = earlier.as_deref() == Some(plan.text.as_bytes());
@@ -331,7 +335,8 @@ impl CellFolder {
         self.path.join("marks").join(mark.to_string())
     }
 
-    /// Returns the path of the log with the warnings of the worker process that ran the cell.
+    /// Returns the path of the log with the warnings of the worker process that ran the cell. If the process ran
+    /// several cells, only the log of the first one has the warnings, and the other logs refer to it.
     pub fn log(&self) -> PathBuf {
         self.path.join("log.txt")
     }
@@ -389,10 +394,11 @@ impl CellFolder {
     }
 
     /// Deletes the failure record. Also deletes the training that failed if another attempt [must restart
-    /// it](FailureRecord::requires_restart).
+    /// it](FailureRecord::requires_restart), or if the record is damaged.
     ///
     /// # Errors
-    /// [`FileError`] if the failure record cannot be read; nothing is deleted then.
+    /// [`FileError`] if the failure record cannot be read, in which case nothing is deleted, or if the training or the
+    /// record cannot be deleted.
     pub fn clear_failure(&self) -> files::Result<()> {
         let path = self.path.join("failure.json");
         match read::<FailureRecord>(&path) {
@@ -408,7 +414,7 @@ impl CellFolder {
     /// process has locked the cell.
     ///
     /// # Errors
-    /// [`FileError`] if the files cannot be deleted.
+    /// [`FileError`] if the lock file cannot be created, and the errors of [`CellFolder::clear_failure`].
     pub fn clear_failure_if(&self, expected: FailureId) -> files::Result<bool> {
         let lock = self.try_lock()?;
         if lock.is_some() && self.failure_id() == Some(expected) {
@@ -425,7 +431,7 @@ impl CellFolder {
         files::write_json(&self.path.join("timing.json"), timing)
     }
 
-    /// Returns the recorded duration of the cell; `None` if there is none.
+    /// Returns the recorded duration of the cell; `None` if `timing.json` is missing or cannot be read.
     pub fn timing(&self) -> Option<Timing> {
         read(&self.path.join("timing.json")).ok().flatten()
     }

@@ -94,8 +94,8 @@ pub enum NoHeatmap {
     NotAlike,
 }
 
-/// Returns a place for the heatmaps of each policy in `selections`, ordered by method, training distribution and run. A
-/// run without a policy has a place too.
+/// Returns a place for the heatmaps of each policy in `selections` that the experiment trained. The places have the
+/// order of `selections`, then of training distributions and runs. A run without a policy has a place too.
 pub fn heatmap_places<'a>(selections: &'a [MethodResults<'a>]) -> Vec<HeatmapPlace<'a>> {
     let mut places = Vec::new();
     for MethodResults { environment, method, runs, .. } in selections.iter().filter(|row| !row.method.external) {
@@ -215,7 +215,8 @@ fn heatmap_name(cell: &Cell, kind: &HeatmapKind) -> String {
 /// Writes the CSV file and the record of `heatmap` for `cell`. `checkpoint` identifies the tested policy.
 ///
 /// # Errors
-/// Errors of the operating system. The folder then has no heatmap of this kind for the cell.
+/// Errors of the operating system. If a file cannot be written, no current heatmap remains at [`heatmap_path`], because
+/// the old record is deleted first.
 pub fn store_heatmap(
     folder: &ExperimentFolder,
     cell: &Cell,
@@ -385,7 +386,7 @@ mod tests {
     }
 
     #[test]
-    fn there_is_room_for_what_the_plan_trains_in_all_runs() {
+    fn every_training_distribution_and_run_of_the_plan_has_a_place() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let done = |cell: &Cell| (cell.id.starts_with("Pendulum-a2c-ff-D") && cell.run == 1).then_some(([0.0; 3], 0.0));
         let results = fixture::results(&plan, done);

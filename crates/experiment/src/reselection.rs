@@ -2,10 +2,11 @@
 //! effect of chance on which configuration was selected.
 //!
 //! Each resample draws runs within each environment, as a bootstrap without selection does. It also repeats every
-//! selection by the plan's rule: it draws tuning seeds, and draws the number of successes of each selection test from a
-//! binomial distribution with the measured rate. The configuration with the highest redrawn rate wins. The statistic
-//! then uses the winner's measured results, not its redrawn rate, because the maximum of several redrawn rates is
-//! biased upwards. Separating the two follows Tsamardinos, Greasidou and Borboudakis (2018,
+//! selection by the plan's rule. With the clean rule, it draws tuning seeds with replacement. With both rules, it draws
+//! the number of successes of each selection test from a binomial distribution with the measured rate. The
+//! configuration with the highest redrawn rate wins. The statistic then uses the winner's measured results, not its
+//! redrawn rate, because the maximum of several redrawn rates is biased upwards. Using different numbers for the
+//! selection and the estimate follows Tsamardinos, Greasidou and Borboudakis (2018,
 //! <https://doi.org/10.1007/s10994-018-5714-4>).
 //!
 //! With the paper's rule, every configuration was tested in every run. With the clean rule, a configuration that was
@@ -175,8 +176,8 @@ impl<'a> Candidates<'a> {
         }
     }
 
-    /// Repeats the selection with redrawn seeds and numbers of successes, and returns the winner. Breaks ties at
-    /// random. Returns `None` if no candidate was tested with a drawn seed.
+    /// Repeats the selection with redrawn seeds and numbers of successes, and returns the winner. Ties of both
+    /// rate and return are broken at random. Returns `None` if no candidate was tested with a drawn seed.
     fn decide(&self, uniform: &mut impl FnMut() -> f64) -> Option<&CandidateConfiguration<'a>> {
         if let [only] = &self.candidates[..] {
             return Some(only);
@@ -230,8 +231,7 @@ impl SelectionTest {
 
 impl DrawnPolicy<'_> {
     /// Returns the metric of this run, %, as if `winners` had been selected. `winners` has one element for each
-    /// selection; `selected` contains indices of this list.
-    /// Returns the reported score if a needed test is missing.
+    /// selection; `selected` contains indices of this list. Returns the reported score if a needed test is missing.
     fn score_of(
         &self,
         metric: Metric,

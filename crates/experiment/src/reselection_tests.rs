@@ -59,8 +59,8 @@ fn a_selection_without_doubt_leaves_the_interval_as_it_is() {
 
 #[test]
 fn doubtful_selection_widens_the_interval() {
-    // Rates of A and B are 0.1 apart, with a standard deviation of some 1.5. So resamples select B almost as often as
-    // A, and the Extrapolation of B is 0.
+    // Rates of A and B are 0.1 percentage points apart, and a redrawn rate has a standard deviation of some 1.5. So
+    // resamples select B almost as often as A, and the Extrapolation of B is 0.
     let [without, with] = by_paper(0.1, Metric::Extrapolation);
     assert!(without[0] > 50.0 && with[0] == 0.0 && with[1] <= without[1], "{without:?} {with:?}");
     // Redrawn rates are not reported, so no number is better than the best measured one.
@@ -105,8 +105,8 @@ fn tuning_cells_replace_missing_final_cells() {
     // selection.
     let [without, with] = by_clean(|is_a, _| if is_a { 70.0 } else { 30.0 });
     assert_eq!(without, with);
-    // A is better only in the mean over both seeds. If a resample draws the second seed twice, it selects B, which has
-    // 10 %.
+    // A is better with the first seed and in the mean over both seeds, and B is better with the second seed. If a
+    // resample draws the second seed twice, it selects B, which has 10 %.
     let [without, with] = by_clean(|is_a, run| {
         if is_a == (run == 1) {
             70.0

@@ -165,7 +165,7 @@ impl<'a> Results<'a> {
 
 impl<'a> MethodResults<'a> {
     /// Counts a tuning cell. The first tuning cell of a training distribution also adds `runs` to the number of cells,
-    /// because so many cells will be trained after the selection.
+    /// because that many cells will be trained after the selection.
     fn tune(&mut self, cell: &'a Cell, state: &'a CellState, runs: u32) {
         let counts_as_cell = usize::from(cell.set.is_none());
         self.cells += counts_as_cell;
@@ -351,7 +351,9 @@ pub fn average(selections: &[&MethodResults<'_>], metric: Metric) -> Option<Summ
     Summary::from_values(&runs.into_iter().map(|(_, numbers)| mean(numbers.into_iter())).collect::<Vec<_>>())
 }
 
-/// Returns the range of [`average`] over all choices among tied configurations; `None` if there are no ties.
+/// Averages [`MethodResults::tie_range`] over the environments of `selections`. An environment without ties counts with
+/// its mean. Unlike [`average`], uses all runs of each environment. Returns `None` if there are no ties, or if an
+/// environment lacks the metric.
 pub fn average_tie_range(selections: &[&MethodResults<'_>], metric: Metric) -> Option<TieRange> {
     let ranges: Vec<Option<TieRange>> = selections.iter().map(|selection| selection.tie_range(metric)).collect();
     let choices = ranges.iter().flatten().map(|range| range.choices).max()?;

@@ -112,8 +112,8 @@ fn metrics_are_those_computed_by_hand() {
     assert_summary(pendulum.summary(Metric::Extrapolation), second / 2.0, second / 2.0, 2);
 
     let both: Vec<&MethodResults<'_>> = selections.iter().collect();
-    // Run 1 has (90 + 50) / 2 = 70, and run 2 has (80 + 60) / 2 = 70. So the deviation of the average is 0, although
-    // each environment has one.
+    // Run 1 has (90 + 50) / 2 = 70, and run 2 has (80 + 60) / 2 = 70. So the standard deviation of the average is 0,
+    // although it is 5 in each environment.
     assert_summary(average(&both, Metric::Default), 70.0, 0.0, 2);
     assert_summary(average(&both, Metric::Interpolation), 52.5, 7.5, 2);
     let [first, second] = [20.0 / 2.0, (40.0 + second) / 2.0];
@@ -148,7 +148,7 @@ fn return_breaks_ties_and_the_rest_is_averaged() {
 }
 
 #[test]
-fn what_is_missing_is_missing_and_never_zero() {
+fn missing_results_do_not_count_as_zero() {
     let plan = plan();
     // Run 2 has no training on R, and CartPole has no training on D in any run.
     let gaps = |environment: &str, version: Version, name: &str, run: u32| match (environment, version, run) {

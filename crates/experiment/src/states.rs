@@ -148,12 +148,12 @@ fn state_of(cell: &Cell, rows: &[&TableRow]) -> Result<CellState, String> {
         let (id, reason, commit) = (cell.id.clone(), reason.clone(), commit.clone());
         return Ok(CellState::Failed(FailureRecord { id, reason, commit, requires_restart: true }));
     }
-    // The rows of the final policy are the last ones with the same number of episodes and without a repeated test set.
-    let first_of_final = rows.iter().enumerate().rposition(|(place, row)| {
+    // The rows of the final policy are at the end. They have the same number of episodes and different test sets.
+    let last_before_final = rows.iter().enumerate().rposition(|(place, row)| {
         let repeats = rows[place + 1..].iter().any(|later| later.tested_on == row.tested_on);
         row.after_episodes != last.after_episodes || repeats
     });
-    let (of_marks, of_final) = rows.split_at(first_of_final.map_or(0, |place| place + 1));
+    let (of_marks, of_final) = rows.split_at(last_before_final.map_or(0, |place| place + 1));
     let mut marks: BTreeMap<u64, IntermediateEvaluation> = BTreeMap::new();
     for row in of_marks {
         let (set, result) = tested(row)?;

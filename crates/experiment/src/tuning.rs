@@ -1,10 +1,10 @@
 //! The clean rule of selection: tuning cells select configurations, which are then trained again with other seeds.
 //!
-//! One configuration is selected for each environment, method and training version: the configuration with the highest
-//! success rate in its selection tests, averaged over tuning seeds. Ties go to the higher mean return in the same
-//! tests, then to the plan's order. Selection starts when every tuning cell has a result or has failed. A configuration
-//! with some failed cells is ranked by its other cells, whose number is [`Chosen::seeds`]. A configuration without any
-//! result cannot be selected.
+//! One configuration is selected for each environment, method and training distribution: the configuration with the
+//! highest success rate in its selection tests, averaged over tuning seeds. Ties go to the higher mean return in the
+//! same tests, then to the plan's order. A selection is made when each of its tuning cells has a result or has failed.
+//! A configuration with some failed cells is ranked by its other cells, whose number is [`Chosen::seeds`]. A
+//! configuration without any result cannot be selected.
 
 use std::collections::HashMap;
 
@@ -128,7 +128,7 @@ impl Plan {
     }
 
     /// Returns the plan with its final number of cells, for estimates. If a configuration is not selected yet, the
-    /// first candidates take the place of the cells that the selection will add.
+    /// candidates of the first configuration take the place of the cells that the selection will add.
     ///
     /// # Errors
     /// [`FolderError`] if a state cannot be read.
@@ -136,8 +136,8 @@ impl Plan {
         self.with_chosen(states, true)
     }
 
-    /// Appends the selected cells to the plan. With `stand_ins`, the first candidates take the places of cells that are
-    /// not selected yet.
+    /// Appends the selected cells to the plan. With `stand_ins`, the candidates of the first configuration take the
+    /// place of cells that are not selected yet.
     fn with_chosen(&self, states: Option<&dyn CellStates>, stand_ins: bool) -> Result<Self, FolderError> {
         let mut plan = self.clone();
         if self.candidates.is_empty() {

@@ -33,7 +33,8 @@ fn is_a(cell: &Cell) -> bool {
 }
 
 /// A function that returns the success rate and the mean return in selection tests. Its arguments are the configuration
-/// ("A" or "B") and the seed. In ordinary tests, the order of A and B is reversed.
+/// ("A" or "B") and the seed. The cells' other tests get the opposite results, 100 - success rate and the negated
+/// return. So these tests rank A and B the other way round.
 type SelectionResultFn = fn(&str, u64) -> Option<(f64, f64)>;
 
 /// Writes the results that `known` returns. Cells for which it returns `None` have failed if `failed` is set, and are
@@ -87,7 +88,7 @@ fn tuning_and_reporting_share_neither_seeds_nor_cells() {
     for (index, cell) in plan.cells.iter().chain(&plan.candidates).enumerate() {
         assert_eq!((cell.index, plan.find(&index.to_string()), plan.find(&cell.id)), (index, Some(cell), Some(cell)));
     }
-    assert_eq!(plan.counts().all_pairs, 16 * 3, "of what is known beforehand");
+    assert_eq!(plan.counts().all_pairs, 16 * 3, "only cells that are known before the selection");
 }
 
 #[test]

@@ -38,8 +38,8 @@ pub enum VerifyError {
     ParameterCheck { cell: String },
 }
 
-/// Reads the recorded episodes in the folder `path`, and checks that they give the same `results` and `agreement`,
-/// which are parts of `result`. Returns the episodes, or `None` if none were recorded.
+/// Reads the recorded episodes in the folder `path`, and checks that they give the same `results` and, if present, the
+/// same `agreement`. Both are parts of `result`. Returns the episodes, or `None` if none were recorded.
 pub(crate) fn follows(
     result: &CellResult,
     path: &Path,
@@ -115,7 +115,7 @@ mod tests {
     #[case(|_: &mut CellResult| (), None)]
     #[case(|result: &mut CellResult| result.results.get_mut("D").unwrap().mean_return += 1e-9, Some("its test on D has 3 episodes"))]
     #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters has another outcome"))]
-    fn a_result_is_that_of_its_recorded_episodes(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
+    fn a_result_must_agree_with_its_records(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();
         let folder = ExperimentFolder::new(directory.path());

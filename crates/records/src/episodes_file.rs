@@ -78,7 +78,7 @@ impl StudyEpisodes {
     }
 
     /// Compares the recorded episodes of `cell` on test set `set` with `replayed`. Returns a description of the first
-    /// episode that differs, or `None` if all are equal or none were recorded.
+    /// episode that differs. Returns `None` if all episodes are equal, or if the file has no episodes of `cell`.
     pub fn first_difference(&self, cell: &str, set: &str, replayed: &Records) -> Option<String> {
         let replayed = without_applied(replayed.clone());
         let mut recorded = self.of_cell(cell)?.episodes_on(set);
@@ -86,8 +86,11 @@ impl StudyEpisodes {
         loop {
             match (recorded.next(), again.next()) {
                 (None, None) => return None,
-                (Some(was), Some(is)) if was == is => {}
-                (Some(was), Some(is)) => return was.difference(is),
+                (Some(was), Some(is)) => {
+                    if let Some(difference) = was.difference(is) {
+                        return Some(difference);
+                    }
+                }
                 (was, _) => {
                     let longer =
                         if was.is_some() { "the record has more episodes" } else { "the record has fewer episodes" };
@@ -130,7 +133,7 @@ impl StudyEpisodes {
             ("achieved".into(), optional(|it| it.achieved)),
             ("also_achieved".into(), optional(|it| it.also_achieved)),
         ];
-        // In rows of environments without this parameter, the parameter's column has no value.
+        // Each parameter has a column. The column has no value in rows of environments without the parameter.
         for name in self.parameters() {
             let value = |(_, records, it): (&String, &Records, &EpisodeRecord)| {
                 let place = records.about.parameters.iter().position(|parameter| parameter.name == name)?;

@@ -43,6 +43,9 @@ fn the_first_differing_episode_is_named() {
     assert_eq!(study.first_difference("c", "E", &replayed), None, "there is nothing to compare with");
     let second = replayed.episodes.iter_mut().filter(|episode| episode.set == "E").nth(1).unwrap();
     second.length = 7;
+    // The success is not compared. An earlier episode with another success does not hide the difference.
+    let first = replayed.episodes.iter_mut().find(|episode| episode.set == "E").unwrap();
+    first.success = !first.success;
     let expected = "E, environment 1, episode 0: length was 6, is 7";
     assert_eq!(study.first_difference("a", "E", &replayed).as_deref(), Some(expected));
     assert_eq!(study.first_difference("a", "D", &replayed), None);

@@ -49,7 +49,7 @@ pub struct ExternalEvaluation {
 /// A policy of an agent that was not trained by an experiment, with its recorded tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct ExternalPolicy {
-    /// Metadata of the policy, apart from those in the records.
+    /// Metadata of the policy that the records do not contain.
     pub known: PolicyMetadata,
     /// The recorded episodes of all its tests.
     pub records: Records,
@@ -215,8 +215,8 @@ impl ExternalEvaluation {
         path.join(ASSESSMENT).is_file()
     }
 
-    /// Reads an evaluation from the folder `path`. If the files do not fit together, tries up to three times, because
-    /// another program may be replacing them.
+    /// Reads an evaluation from the folder `path`. If the folder has an `assessment.json` but cannot be read, tries up
+    /// to three times, because another program may be replacing the files.
     ///
     /// # Errors
     /// [`ExternalEvaluationError`], with the path of the file.

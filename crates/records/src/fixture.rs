@@ -53,8 +53,8 @@ pub fn heatmap(grid: usize, figures: impl Fn(f64, f64) -> (f64, f64)) -> Heatmap
 }
 
 /// Returns an agent in `environment` with one policy for each element of `trained_on`. Each policy has tests of ten
-/// episodes on the versions D, R and E, and `steps` are the lengths of their first episodes. Each further episode of a
-/// test is one step longer. 195 steps are a success.
+/// episodes on the versions D, R and E. `steps` has the length of the first episode of each of these tests. Each
+/// further episode of a test is one step longer. An episode of at least 195 steps is a success.
 pub fn assessed(agent: &str, environment: &str, trained_on: &[Option<Version>], steps: [u32; 3]) -> ExternalEvaluation {
     let criterion = |threshold| Criterion {
         quantity: "steps".into(),

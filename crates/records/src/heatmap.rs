@@ -358,7 +358,7 @@ mod tests {
     }
 
     #[test]
-    fn it_is_said_where_other_parameters_come_from() {
+    fn others_names_the_source_of_the_other_parameters() {
         let heatmap = fixture::heatmap(1, |_, _| (0.0, 0.0));
         assert_eq!(heatmap.others(), "other parameters at their defaults");
         let drawn = Heatmap { base: Version::R, fixed: [("force".to_owned(), 7.5)].into(), ..heatmap };

@@ -2,8 +2,9 @@
 //! parameters of its environments, with the environments' seeds and indices. The audit checks that the training drew
 //! from the claimed distribution, and that it never drew from the policy's test sets.
 //!
-//! The audit first finds the training by its seed, and the access tokens of its sessions. The owners of these tokens
-//! may have learned from all parameters that were drawn with these tokens, in any session, before the training ended.
+//! The audit first finds the training's sessions by the training's seed, and then the access tokens of these sessions.
+//! The owners of these tokens may have learned from all parameters that were drawn with these tokens, in any session,
+//! before the training ended.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write as _;
@@ -119,7 +120,8 @@ struct Drawn {
     region: Arc<Region>,
 }
 
-/// The last episode that an environment began: none, the episode with an index, or not recorded.
+/// The last episode that an environment began: `None` if it began no episode, otherwise the episode's index. `Unknown`
+/// if the ledger does not record it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum LastDraw {
     None,
@@ -127,7 +129,7 @@ enum LastDraw {
     Unknown,
 }
 
-/// A session's request to draw parameters from a region of the parameter space, which the server refused.
+/// A request that the server refused: a session's request to draw parameters from a region of the parameter space.
 #[derive(Debug)]
 struct Refused {
     line: LedgerLine,

@@ -152,7 +152,7 @@ fn sessions_on_several_servers_are_found_in_all_their_ledgers() {
 #[test]
 fn an_end_belongs_to_open_draws_and_not_to_later_ones() {
     let [begun, ended] = trained();
-    // The same seed is drawn twice. The second drawing has no recorded end.
+    // The same environment begins twice to draw parameters. Its second draws have no recorded end.
     let again = begins(1, "ann", R, (7, 0, 1, 0));
     let reset = [begun.clone(), again.clone(), ends(1, "ann", (7, 0, 1, 0)), again, ended.clone()];
     let found = proof(&reset);

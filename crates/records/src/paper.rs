@@ -113,9 +113,9 @@ mod tests {
         assert_eq!(
             number("CartPole", &Method { observe: Observe::Parameters, ..ppo }, Metric::Default),
             None,
-            "it saw less"
+            "the paper's PPO did not see the parameters"
         );
-        assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "it has trials");
+        assert_eq!(number("Pendulum", &method("rl2-a2c", "rc", None), Metric::Default), None, "RL² has a trial length");
         let with = |trials| number("Average", &method("rl2-a2c", "rc", Some(trials)), Metric::Default).unwrap().mean;
         assert_eq!([1, 2, 5].map(with), [66.83, 45.79, 41.08]);
     }

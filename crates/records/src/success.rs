@@ -24,8 +24,8 @@ pub struct Criterion {
     pub side: Side,
     /// The threshold, in the quantity's unit.
     pub threshold: f64,
-    /// The maximum value that an episode can have: the step limit, if the quantity is a number of steps. Thresholds
-    /// above it are rejected.
+    /// The maximum value that an episode can have: the step limit if the quantity is a number of steps, otherwise
+    /// `None`. Thresholds above the maximum are rejected.
     #[serde(default)]
     pub most: Option<f64>,
 }
@@ -53,7 +53,8 @@ pub struct Threshold {
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
 pub enum Rule {
-    /// The environment's own criterion: the one that Packer et al. (2018) state in their paper.
+    /// The environment's own criterion. In the paper's environments, this is the one that Packer et al. (2018) state in
+    /// their paper.
     Text,
     /// The criterion that the published code of Packer et al. (2018) uses.
     Code,
@@ -65,8 +66,8 @@ pub enum Rule {
 const THRESHOLD: &str = "the success threshold";
 
 impl Criterion {
-    /// Returns the criterion that Packer et al. (2018) state in their paper for `environment`. `None` if the server did
-    /// not report it.
+    /// Returns the own criterion of `environment`. In the paper's environments, this is the one that Packer et al.
+    /// (2018) state in their paper. `None` if the server did not report it.
     pub fn from_environment(environment: &proto::Environment) -> Option<Self> {
         Self::read(environment.success.as_ref()?, environment.step_limit)
     }
@@ -113,8 +114,8 @@ impl Rule {
     /// Returns the criterion that this rule chooses. `text` and `code` are the environment's two criteria.
     ///
     /// # Errors
-    /// [`ValueError`] if neither criterion compares the threshold's quantity, or if the server did not state the
-    /// criterion.
+    /// [`ValueError`] if the server did not state the criterion. For a threshold, also if neither criterion compares
+    /// the threshold's quantity, or if the threshold is above the step limit.
     pub fn criterion(&self, text: Option<&Criterion>, code: Option<&Criterion>) -> Result<Criterion, ValueError> {
         let unknown = |missing: &'static str| {
             let expected = format!("left out: the server does not report {missing}");
@@ -230,11 +231,11 @@ mod tests {
             "the rule of success is code, but must be left out: the server does not report the success rule of the \
              paper's code"
         );
-        assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "nobody counts them");
+        assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "no criterion compares this quantity");
         for rule in ["text", "code", "steps=90"] {
             assert_eq!(rule.parse::<Rule>().unwrap().to_string(), rule);
         }
-        assert_eq!(" Code".parse::<Rule>().unwrap(), Rule::Code, "as other names are spelled");
+        assert_eq!(" Code".parse::<Rule>().unwrap(), Rule::Code, "case and spaces do not matter");
     }
 
     #[test]

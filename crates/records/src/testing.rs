@@ -152,8 +152,8 @@ fn check_requested(
     })
 }
 
-/// Returns the index of a parameter outside of its permitted values, or `None` if one alternative of `asked` permits
-/// all of them.
+/// Returns the index of a parameter whose value is not permitted. Returns `None` if one alternative of `asked` permits
+/// the values of all parameters.
 fn forbidden_index(asked: &[Vec<Distribution>], requested: &[f64]) -> Option<usize> {
     let in_part = |asked: &Vec<Distribution>| {
         let requested = requested.iter().copied().chain(std::iter::repeat(f64::NAN));
@@ -220,7 +220,7 @@ mod tests {
     }
 
     #[test]
-    fn what_did_not_run_as_it_was_asked_to_is_no_record() {
+    fn episodes_that_did_not_run_as_requested_are_not_recorded() {
         assert!(finished(Version::E, &[end(0, 0, 3.5, 3.5)]).is_ok());
         for (version, end, part) in [
             (Version::E, end(0, 0, 1.0, 1.0), "asked for length in [3, 4], but its receipt says 1"),
@@ -243,7 +243,7 @@ mod tests {
         assert_eq!(
             (forbidden_index(&both[..1], &[1.5, 2.5]), forbidden_index(&both[..1], &[1.5])),
             (Some(1), Some(1)),
-            "nor is what is missing"
+            "a missing value is forbidden, too"
         );
     }
 
@@ -285,7 +285,7 @@ mod tests {
         };
         let seeds: Vec<u64> = of(Purpose::TestEnvironments).chain(of(Purpose::SelectionEnvironments)).collect();
         let distinct: std::collections::HashSet<u64> = seeds.iter().copied().collect();
-        assert_eq!(distinct.len(), 800, "those of a test never select");
+        assert_eq!(distinct.len(), 800, "a seed of reported tests is never a seed of a selection");
         assert!(seeds.iter().all(|&seed| seed > 1000), "none is a seed that people train with");
     }
 }

@@ -21,7 +21,7 @@ pub struct PolicyHeatmap {
 
 /// Returns a picture of heatmaps side by side, and a table of its numbers. Each combination of method and training
 /// distribution is a column, which shows the mean over its policies. Returns `None` if there are no policies, or if
-/// their heatmaps have different grids.
+/// their heatmaps have different axes, grids or other options.
 pub fn policies_side_by_side(policies: &[PolicyHeatmap]) -> Option<(HeatmapPanels, Table)> {
     let heatmaps: Vec<Heatmap> = policies.iter().map(|policy| policy.heatmap.clone()).collect();
     let all = Heatmap::mean(&heatmaps)?;
@@ -51,7 +51,8 @@ pub fn policies_side_by_side(policies: &[PolicyHeatmap]) -> Option<(HeatmapPanel
     Some((panels, table(&columns)))
 }
 
-/// Returns a table with a row for each column and grid point. For a single column, the table leaves out the caption.
+/// Returns a table with a row for each column of the picture and grid point. For a single column of the picture, the
+/// table leaves out the caption and the number of policies.
 fn table(columns: &[(String, usize, Heatmap)]) -> Table {
     if let [(.., mean)] = columns {
         return heatmap_table(mean);

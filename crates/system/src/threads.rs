@@ -9,8 +9,8 @@ use rustix::process::{Resource, getrlimit};
 pub fn explain_no_thread(error: &Error) -> Error {
     let limit = getrlimit(Resource::Nproc).current.map_or_else(|| "unlimited".into(), |limit| limit.to_string());
     let words = format!(
-        "the system starts no further thread or process ({error}): this user may have {limit} of them in all (`ulimit -u`, \
-         RLIMIT_NPROC), and a container as many as its pids.max; raise the limit, or end other programs"
+        "the system cannot start another thread or process ({error}): this user may have {limit} of them in all \
+         (`ulimit -u`, RLIMIT_NPROC), and a container as many as its pids.max; raise the limit, or end other programs"
     );
     Error::new(error.kind(), words)
 }

@@ -81,5 +81,5 @@ pub type EpisodeMessage<'a> = (u32, Option<&'a proto::Episode>, Option<&'a proto
 
 /// Returns the error for a reply whose episodes or receipts do not fit the session.
 pub fn mismatched_episodes() -> PyErr {
-    failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of other lengths")
+    failure(MALFORMED, 0, "the server sent episodes that do not fit the batch, or receipts of a wrong length")
 }

@@ -177,7 +177,7 @@ impl PythonPlayer {
             Ok(playing) => Ok(playing),
             Err(TryLockError::Poisoned(poisoned)) => Ok(poisoned.into_inner()),
             Err(TryLockError::WouldBlock) => {
-                Err(failure(UNUSABLE, 0, "another thread acts with it: a policy's actor is for one thread at a time"))
+                Err(failure(UNUSABLE, 0, "another thread is using this actor; only one thread at a time may use it"))
             }
         }
     }

@@ -77,7 +77,11 @@ impl PythonTests {
             if **environment == **served {
                 return Ok(());
             }
-            return Err(failure(MALFORMED, 0, "the server describes the environment otherwise than at the first test"));
+            return Err(failure(
+                MALFORMED,
+                0,
+                "the server describes the environment differently than in the first test",
+            ));
         }
         policy.map_or(Ok(()), |policy| policy.check_unchanged(served))?;
         self.sets.iter().try_for_each(|set| set.check(served)).map_err(|error| invalid(&error))?;

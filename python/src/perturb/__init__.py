@@ -107,5 +107,7 @@ if not _typing.TYPE_CHECKING:  # hidden from type checkers, so that they reject 
         if name not in _DEPRECATED:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         new = _DEPRECATED[name]
-        _warnings.warn(f"perturb.{name} is now perturb.{new}; the old name goes in version 0.3", DeprecationWarning, 2)
+        _warnings.warn(
+            f"perturb.{name} is now perturb.{new}; the old name will be removed in version 0.3", DeprecationWarning, 2
+        )
         return globals()[new]

@@ -37,7 +37,7 @@ Stepped: TypeAlias = tuple[
 ]
 
 class NativeServer:
-    """An embedded server. Its sessions end when it is closed."""
+    """An embedded server. Its threads end when the server and all its sessions are closed."""
 
     def __init__(self, task: tuple[Path, str, str] | None = None) -> None: ...
     def close(self) -> None: ...

@@ -40,7 +40,7 @@ def parse_address(text: str) -> Address:
         return InvalidArgumentError(f"server={text!r} is not a server's address: {reason}; {forms}")
 
     if not isinstance(text, str):
-        raise refuse("it is no text")
+        raise refuse("it is not a string")
     if text == EMBEDDED.target:
         return EMBEDDED
     if text.startswith("unix:"):

@@ -295,7 +295,7 @@ class Assessment:
             import pandas as pd
         except ImportError as error:
             raise ImportError(
-                "to_pandas() needs pandas, which perturb does not bring: pip install pandas; columns() needs nothing"
+                "to_pandas() needs pandas, which perturb does not install: pip install pandas; columns() needs nothing"
             ) from error
         return pd.DataFrame(self.columns())
 
@@ -410,7 +410,8 @@ class Assessment:
     def _title(self) -> str:
         how = {ACTIONS[result.deterministic] for result in self.results} - {""}
         actions = f"; actions are {' or '.join(sorted(how))}" if how else ""
-        return f"{self.environment}, a success is {self.success or 'what the server says'}{actions}"
+        success = f"a success is {self.success}" if self.success else "the server decides about success"
+        return f"{self.environment}, {success}{actions}"
 
 
 def _unpickled_assessment(files: dict[str, bytes]) -> Assessment:

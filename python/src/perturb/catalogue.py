@@ -173,7 +173,7 @@ class Description:
         if served.model_hash != self.model_hash:
             raise ProtocolError(
                 f"the files of {self.name} changed since it was made: its model was {self.model_hash}, the server's is "
-                f"{served.model_hash}; make it anew"
+                f"{served.model_hash}; make it again"
             )
 
 

@@ -137,8 +137,8 @@ class Client:
     def open(self, seeds: Sequence[int], generator: np.random.Generator) -> OpenedSession | None:
         """Open a session and begin the first episodes. If a session is open already, return None and do nothing.
 
-        `seeds[0]` is the seed of the batch. If `seeds` is empty, the generator draws the seed. Each environment has the
-        parameters of its context. Parameters that earlier resets set replace these.
+        `seeds[0]` is the seed of the batch. If `seeds` is empty, the generator draws the seed. An environment starts
+        with the parameters of its context, if it has one. Parameters that earlier resets set take precedence.
 
         Raises:
             OutOfOrderError: if a snapshot was restored in the last session, and that session was lost. The parameters
@@ -189,8 +189,7 @@ class Client:
         count = len(contexts)
         if count > self.num_envs:
             raise InvalidArgumentError(
-                f"there are {count} contexts for num_envs={self.num_envs}: each environment has one, so give at least "
-                "as many environments"
+                f"{count} contexts need at least {count} environments; num_envs is {self.num_envs}"
             )
         fixed = [{name: [(value, value)] for name, value in context.items()} for context in contexts]
         self._own_parameters = [fixed[slot % count] for slot in range(self.num_envs)]
@@ -276,7 +275,7 @@ class Client:
 
     def _require_not_closed(self) -> None:
         if self._closed:
-            raise OutOfOrderError("the environment was closed; make it anew")
+            raise OutOfOrderError("the environment was closed; make it again")
 
 
 def _bytes(mask: NDArray[np.bool_] | None) -> bytes:

@@ -159,7 +159,7 @@ class Comparison:
             import pandas as pd
         except ImportError as error:
             raise ImportError(
-                "to_pandas() needs pandas, which perturb does not bring: pip install pandas; rows() needs nothing"
+                "to_pandas() needs pandas, which perturb does not install: pip install pandas; rows() needs nothing"
             ) from error
         return pd.DataFrame(self.columns() if table == "episodes" else self.rows(table))
 
@@ -252,9 +252,7 @@ class Comparison:
         if x is None:
             raise InvalidArgumentError(f"no parameter varies in the test on {tested_on}: there is nothing to draw over")
         y = y or (unused.pop(0) if unused else None)
-        title = (
-            title or f"{self.environment}, a success is {self.success or 'what the server says'}: tested on {tested_on}"
-        )
+        title = title or f"{self._title()}: tested on {tested_on}"
         if y is None:  # one varying parameter: a curve for each condition
             lines = {
                 name: plots.pooled([one.success_by_parameter(tested_on, x) for one in policies.values()])
@@ -290,7 +288,8 @@ class Comparison:
     def _title(self) -> str:
         if not self.evaluations:
             return f"{self.environment}, rows of a results table"
-        return f"{self.environment}, a success is {self.success or 'what the server says'}"
+        success = f"a success is {self.success}" if self.success else "the server decides about success"
+        return f"{self.environment}, {success}"
 
     def _means_table(self) -> list[list[str]]:
         heading = _HEADINGS[self.score][0]

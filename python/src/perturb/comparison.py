@@ -121,7 +121,7 @@ def compare(
         of_tests = (environment, episodes, seed, parameters, contexts, success, observe, deterministic, normalizer)
         if task is not None or any(option is not None for option in of_tests):
             raise InvalidArgumentError(
-                "rows of a results table are not tested again; expected versions, score and baseline alone"
+                "rows of a results table are not tested again; only versions, score and baseline may be given"
             )
         names = None if versions is None else [it.name if isinstance(it, Set) else it for it in versions]
         return _comparison(
@@ -229,7 +229,7 @@ def _rows(conditions: Any) -> list[tuple[str, list[dict[str, Any]]]] | None:
     for name, frame in conditions.items():
         if not hasattr(frame, "groupby"):
             raise InvalidArgumentError(
-                f"the condition {name!r} is not of rows of `read_results`; expected rows for all or for none"
+                f"the condition {name!r} is not a DataFrame of `read_results`; expected rows for all or for none"
             )
         missing = [column for column in _COLUMNS if column not in frame.columns]
         if missing:

@@ -54,8 +54,8 @@ def read(policy: _native.Policy) -> Network:
     """
     if policy.sees_rewards:
         raise PolicyError(
-            f"the policy {policy.id} sees actions and rewards beside observations (RL²), which no exported network "
-            "does: use policy.actor()"
+            f"the policy {policy.id} also takes actions and rewards as inputs (RL²), which exported networks do not "
+            "support: use policy.actor()"
         )
     with tempfile.TemporaryDirectory(prefix="perturb-") as folder:
         policy.save(folder)
@@ -108,7 +108,7 @@ def to_torch(network: Network) -> Any:
     try:
         import torch
     except ImportError as error:
-        raise ImportError("to_torch() needs torch, which perturb does not bring: pip install torch") from error
+        raise ImportError("to_torch() needs torch, which perturb does not install: pip install torch") from error
 
     def linear(weight: NDArray[np.float32], bias: NDArray[np.float32] | None) -> Any:
         layer = torch.nn.Linear(weight.shape[1], weight.shape[0], bias=bias is not None)
@@ -164,7 +164,7 @@ def to_onnx(network: Network, path: str) -> None:
         import onnx
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
-        raise ImportError("to_onnx() needs onnx, which perturb does not bring: pip install onnx") from error
+        raise ImportError("to_onnx() needs onnx, which perturb does not install: pip install onnx") from error
     nodes: list[Any] = []
     constants: list[Any] = []
 

@@ -163,7 +163,8 @@ class LocalServer:
                     return
                 if line is not None:
                     continue
-                reason = f"it ended with status {self.process.wait()} before it listened; its messages are above"
+                status = self.process.wait()
+                reason = f"it ended with status {status} before it listened; its messages are on standard error"
             self.end()
             raise ServerStartError(f"the private server {program} did not start: {reason}")
 

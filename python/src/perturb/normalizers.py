@@ -65,7 +65,7 @@ def _read(path: Path) -> Any:
         raise PolicyError(f"normalizer={str(path)!r} cannot be read: {error.strerror or error}") from error
     except Exception as error:
         raise PolicyError(
-            f"normalizer={str(path)!r} is no saved VecNormalize ({error}); give what VecNormalize.save(path) wrote"
+            f"normalizer={str(path)!r} is not a saved VecNormalize ({error}); give what VecNormalize.save(path) wrote"
         ) from error
 
 
@@ -86,7 +86,7 @@ def _require_untouched(model: Any) -> None:
     )
     was_trained = f"this {type(model).__name__} model was trained under a VecNormalize, but was loaded without it"
     if not hasattr(model, "replay_buffer"):  # an on-policy model
-        raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
+        raise PolicyError(f"{was_trained}, so it may receive observations on a scale that it was not trained on: {how}")
     if model.get_env() is not None:
         return  # the model has its environment, from training or as an argument of load(), without a VecNormalize
     if last is None or np.shape(last) != np.shape(original) or len(original) < 3:
@@ -95,7 +95,9 @@ def _require_untouched(model: Any) -> None:
             f"trained under a VecNormalize: {how}"
         )
     if not np.array_equal(last, original) and _is_affine(np.asarray(original, float), np.asarray(last, float)):
-        raise PolicyError(f"{was_trained}, so it would act on observations that it does not know: {how}")
+        raise PolicyError(
+            f"{was_trained}, so it would receive observations on a scale that it was not trained on: {how}"
+        )
 
 
 def _is_affine(original: np.ndarray[Any, Any], last: np.ndarray[Any, Any]) -> bool:

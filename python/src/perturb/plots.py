@@ -167,7 +167,7 @@ def _pyplot() -> Any:
         import matplotlib.pyplot as plt
     except ImportError as error:
         raise ImportError(
-            "pictures need matplotlib, which perturb does not bring: pip install 'perturb-rl[plot]', or pip install "
+            "pictures need matplotlib, which perturb does not install: pip install 'perturb-rl[plot]', or pip install "
             "matplotlib; success_by_parameter() and success_by_parameters() have the numbers, to_html() has pictures"
         ) from error
     return plt

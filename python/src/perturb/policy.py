@@ -34,7 +34,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
             perturb. The message names the file.
     """
     if not isinstance(path, str | os.PathLike):
-        raise InvalidArgumentError(f"path is {path!r}; expected the folder of a training")
+        raise InvalidArgumentError(f"path is {path!r}; expected the path of a training, a checkpoint or a policy file")
     return Policy(native(_native.Policy.load, os.fspath(path)))
 
 

@@ -61,7 +61,9 @@ def version(name: Any, what: str = "version") -> Version:
 def observes_parameters(observe: Any) -> bool:
     """Whether the option `observe` appends the parameters to observations."""
     if observe not in ("state", "parameters"):
-        raise InvalidArgumentError(f"observe={observe!r} is none of 'state' and 'parameters' (both, state first)")
+        raise InvalidArgumentError(
+            f"observe={observe!r}; expected 'state' or 'parameters' (the state followed by the parameters)"
+        )
     return bool(observe == "parameters")
 
 
@@ -238,7 +240,7 @@ def no_unknown(unknown: Mapping[str, Any], known: Sequence[str]) -> None:
         name = next(iter(unknown))
         meant = difflib.get_close_matches(name, known, n=1)
         hint = f" (did you mean {meant[0]}=?)" if meant else ""
-        raise InvalidArgumentError(f"{name}= is no setting of environments{hint}; there are {', '.join(known)}")
+        raise InvalidArgumentError(f"{name}= is not a setting of environments{hint}; there are {', '.join(known)}")
 
 
 def parameter_values(parameters: Parameters, description: Description) -> Intervals:
@@ -255,8 +257,8 @@ def parameter_values(parameters: Parameters, description: Description) -> Interv
     for name, intervals in values.items():
         if name not in description.parameters and name in description.disturbances:
             raise InvalidArgumentError(
-                f"{name!r} is a disturbance, and this environment was made without: give parameters={{{name!r}: "
-                f"{description.undisturbed[name]:g}}} where it is made"
+                f"{name!r} is a disturbance, and this environment was made without disturbances; pass "
+                f"parameters={{{name!r}: {description.undisturbed[name]:g}}} where it is made"
             )
         if name not in description.parameters:
             raise UnknownNameError(

@@ -36,7 +36,7 @@ def read_results(path: str | os.PathLike[str], settings: Iterable[str] = ()) -> 
     try:
         import pandas as pd
     except ImportError as error:
-        raise ImportError("read_results() needs pandas, which perturb does not bring: pip install pandas") from error
+        raise ImportError("read_results() needs pandas, which perturb does not install: pip install pandas") from error
     if not isinstance(path, str | os.PathLike):
         raise InvalidArgumentError(f"path is {path!r}; expected a file that `perturb export` wrote")
     columns, plans = native(_native.read_results, os.fspath(path))

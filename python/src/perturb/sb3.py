@@ -24,7 +24,7 @@ try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 except ImportError as error:
     raise ImportError(
-        "perturb.sb3 needs stable-baselines3, which perturb does not bring: pip install stable-baselines3"
+        "perturb.sb3 needs stable-baselines3, which perturb does not install: pip install stable-baselines3"
     ) from error
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 # Methods that `env_method` accepts, with their number of arguments.
 _METHODS = {"snapshot": 0, "restore": 1, "render": 0, "set_parameters": 1}
-# Settings of PerturbVectorEnv whose values stable-baselines3 determines.
+# Settings of PerturbVectorEnv that `make_vec_env` does not accept.
 _FIXED = ("autoreset_mode", "copy")
 
 
@@ -58,7 +58,7 @@ def make_vec_env(
     """
     for name in _FIXED:
         if name in settings:
-            raise InvalidArgumentError(f"{name}= is fixed, because stable-baselines3 needs its value; leave it out")
+            raise InvalidArgumentError(f"{name}= cannot be set here; leave it out")
     settings.setdefault("receipts", False)
     batch = PerturbVectorEnv(environment, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
     return PerturbVecEnv(batch, seed)

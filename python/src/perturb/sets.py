@@ -183,14 +183,16 @@ def heatmap(
     ranges = []
     for name in axes:
         if name is None:
-            raise InvalidArgumentError(f"give x= and y=: it is not known which of {known.name}'s parameters to show")
+            raise InvalidArgumentError(f"give x= and y=: {known.name} has no default heatmap axes")
         if name not in known.parameters:
             raise UnknownNameError(f"{known.name} has no parameter {name!r}, only {', '.join(known.parameters)}")
         intervals = known.parameters[name].random + known.parameters[name].extreme
         ranges.append((name, min(low for low, _ in intervals), max(high for _, high in intervals)))
     wrong = [name for name in axes if name in (fixed or {})]
     if axes[0] == axes[1] or wrong:
-        raise InvalidArgumentError(f"{wrong[0] if wrong else axes[0]} is an axis, and cannot be something else, too")
+        raise InvalidArgumentError(
+            f"{wrong[0] if wrong else axes[0]} is given twice; an axis cannot also be the other axis or in fixed"
+        )
     points = requests.count(points, "points", 2, _native.MAX_HEATMAP_POINTS)
     contexts = native(_native.heatmap_contexts, ranges, points, dict(fixed or {}))
     return listed(_native.HEATMAP_SET, contexts, base=base)

@@ -40,8 +40,8 @@ def find_folder(task: str | os.PathLike[str] | None, server: object = None) -> T
         raise InvalidArgumentError(f"task={task!r}; expected the path of a folder with a task.toml")
     if server is not None and str(server) != EMBEDDED.target:
         raise InvalidArgumentError(
-            f"task={os.fspath(task)!r} is for a server of this process's own, and server={str(server)!r} is another's: "
-            "leave server= out, or start that server with `perturb-server --task DIR` and leave task= out"
+            f"task={os.fspath(task)!r} needs a private or embedded server, but server={str(server)!r} is the address "
+            "of another: leave server= out, or start that server with `perturb-server --task DIR` and leave task= out"
         )
     path = Path(task).absolute()
     if not (path / "task.toml").is_file():

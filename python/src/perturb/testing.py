@@ -134,7 +134,8 @@ def play(
     tested = players.prepare(policy, fits, deterministic=settings.deterministic, normalizer=normalizer, name=name)
     if expected not in (None, tested.name):
         raise PolicyError(
-            f"the tests were recorded of {expected}, this is {tested.name}: give the policy that was tested"
+            f"the tests were recorded with {expected}, but this policy is {tested.name}: give the policy that was "
+            "tested"
         )
     seed = requests.seed(
         (1 if tested.loaded is None else tested.loaded.seed) if settings.seed is None else settings.seed
@@ -169,7 +170,9 @@ def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple
     if not isinstance(policy, Mapping):
         return [(None if trained_on is None else requests.version(trained_on, "trained_on"), policy, normalizer)]
     if trained_on is not None:
-        raise InvalidArgumentError("trained_on= is said by the keys of a mapping of policies; leave it out")
+        raise InvalidArgumentError(
+            "the keys of the mapping of policies already state the training versions; leave trained_on= out"
+        )
     if not policy:
         raise InvalidArgumentError("policy is an empty mapping; expected policies by the versions they were trained on")
     if normalizer is False:

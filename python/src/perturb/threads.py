@@ -14,7 +14,7 @@ def start_thread(name: str, function: Callable[..., None], *arguments: Any) -> t
     """Start a daemon thread that calls a function.
 
     Raises:
-        PerturbError: if the system starts no further thread. The message names the limit.
+        PerturbError: if the system cannot start another thread. The message names the limit.
     """
     thread = threading.Thread(target=function, name=name, args=arguments, daemon=True)
     try:
@@ -22,7 +22,7 @@ def start_thread(name: str, function: Callable[..., None], *arguments: Any) -> t
     except RuntimeError as error:
         limit = resource.getrlimit(resource.RLIMIT_NPROC)[0]
         raise PerturbError(
-            f"the system starts no further thread or process ({error}): this user may have "
+            f"the system cannot start another thread or process ({error}): this user may have "
             f"{'unlimited' if limit == resource.RLIM_INFINITY else limit} of them in all (`ulimit -u`, RLIMIT_NPROC), "
             "and a container as many as its pids.max; raise the limit, or end other programs"
         ) from error

@@ -31,8 +31,8 @@ pub struct DrawAuditor {
     refused: Arc<AtomicU32>,
 }
 
-/// The maximum number of refusals of one session in the ledger, because a client can repeat a refused request
-/// endlessly.
+/// The maximum number of refusals of one session that the ledger records. Without this limit, a client could fill the
+/// ledger by repeating a refused request.
 const MAX_LOGGED_REFUSALS: u32 = 100;
 
 /// The number of bytes of a ledger line that are charged as one step.
@@ -205,7 +205,7 @@ impl DrawAuditor {
     }
 
     /// Checks draws that are about to begin, and records them, with the draws that they replace (`ends`), in one ledger
-    /// line. Each item of `begins` is a number of successive environments, and the first environment's draw.
+    /// line. Each item of `begins` is the draw of the first of several successive environments, and their number.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,

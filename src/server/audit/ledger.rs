@@ -255,7 +255,7 @@ impl LedgerWriter {
 
     /// Writes all events as lines, and waits until they are on the disk. On an error, writes none.
     fn write<'a>(&mut self, events: impl IntoIterator<Item = &'a LedgerEvent>) -> Result<(), String> {
-        #[expect(clippy::disallowed_methods, reason = "lines have their time; what is drawn does not depend on it")]
+        #[expect(clippy::disallowed_methods, reason = "each line states its time; draws do not depend on it")]
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let unix_ms = u64::try_from(now.as_millis()).unwrap_or(u64::MAX);
         self.check_file()?;

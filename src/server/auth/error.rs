@@ -71,7 +71,7 @@ mod tests {
     use crate::server::error::ErrorCounters;
 
     #[test]
-    fn kinds_are_counted_by_themselves() {
+    fn each_kind_is_counted_separately() {
         let counters = ErrorCounters::default();
         let of_a_token = |wanted| Error::QuotaExceeded { name: "ann".into(), wanted, limit: 4, what: "sessions" };
         for error in [of_a_token(5), of_a_token(1), of_a_token(4), Error::NoToken] {

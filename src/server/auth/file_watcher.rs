@@ -52,9 +52,10 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Starts a thread that calls `reload` with the contents of the files whenever they have changed from `before`. A
-    /// change counts when two successive readings are equal, because another program may still be writing. A
-    /// [`Reloader`] skips this check. Errors are logged, and watching continues.
+    /// Starts a thread that calls `reload` with the contents of the files whenever these differ from the last contents,
+    /// at first `before`. New contents count only when two successive readings are equal, because another program may
+    /// still be writing. A [`Reloader`] skips this check. Errors are logged, and watching continues. `what` names the
+    /// files in the log.
     ///
     /// # Errors
     /// If the operating system cannot start a thread.

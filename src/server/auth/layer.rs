@@ -18,8 +18,8 @@ use tonic::{
 };
 use tower::Layer;
 
-/// A tower service that lets only calls with a valid token through to the wrapped service. If the server has no tokens,
-/// all calls pass.
+/// A tower service that passes a call over TCP to the wrapped service only if the call has a valid token. Calls over a
+/// Unix socket need no token. If the server does not use tokens, all calls pass.
 #[derive(Clone)]
 pub struct AuthService<S> {
     service: S,

@@ -115,7 +115,7 @@ impl Token {
     /// Waits until the token's rate allows further steps, at most 30 s.
     ///
     /// # Errors
-    /// [`Error::TooFast`], immediately, if the wait would be longer.
+    /// [`Error::TooFast`], as soon as it is known that the wait would be longer.
     pub async fn acquire_steps(&self) -> Result<(), Error> {
         self.acquire_within(MAX_WAIT).await
     }
@@ -123,7 +123,7 @@ impl Token {
     /// Waits until the token's rate has allowed all steps that the token was charged for.
     ///
     /// # Errors
-    /// [`Error::TooFast`], immediately, if the wait would be longer than `max_wait`.
+    /// [`Error::TooFast`], as soon as it is known that the wait would be longer than `max_wait`.
     pub async fn acquire_within(&self, max_wait: Duration) -> Result<(), Error> {
         let acquired = self.quotas.rate_limiter.acquire(max_wait).await;
         acquired.map_err(|TooFast { rate, ahead }| Error::TooFast {
@@ -211,8 +211,8 @@ impl Tokens {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.usage()).collect()
     }
 
-    /// Replaces the tokens by those of a new text of the token file. A token whose digest and role are unchanged keeps
-    /// its sessions; all other old tokens are revoked.
+    /// Replaces the tokens by those of a new text of the token file. A token whose name, digest and role are unchanged
+    /// keeps its sessions; all other old tokens are revoked.
     ///
     /// # Errors
     /// [`TokenFileError`], if the text is invalid; the tokens are unchanged then.
@@ -292,7 +292,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_found_by_itself_or_by_its_digest() {
+    fn a_token_is_found_whether_its_entry_has_the_text_or_the_digest() {
         let (token, entry) = new_token("bob \"the\" builder").unwrap();
         let tokens = tokens_of(&(entry + &file(SECRET, ""))).unwrap();
         let name = |shown: &str| tokens.find(shown.as_bytes()).map(|token| token.name().to_owned());
@@ -319,7 +319,7 @@ mod tests {
     #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
     #[case::twice(&(file(SECRET, "") + &file("another-horse-battery", "")), 4, "two tokens called \"ann\"")]
     #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "of another entry")]
-    fn a_wrong_file_is_refused_with_its_line_and_no_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {
+    fn invalid_file_is_refused_with_line_but_not_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {
         let wrong = tokens_of(text).err().unwrap();
         assert_eq!(wrong.line, line, "{wrong}");
         let words = wrong.to_string();

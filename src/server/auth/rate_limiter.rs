@@ -8,8 +8,8 @@ use std::{
 };
 use tokio::time::{Instant, sleep};
 
-/// The length of a burst: a client that was idle may run the steps that the rate allows in this time, in seconds, at
-/// once.
+/// The length of a burst, in seconds: a client that was idle may run at once the steps that the rate allows in this
+/// time.
 const BURST_SECONDS: f64 = 1.0;
 /// The maximum wait. A request that would wait longer is refused, because clients wait a minute for a reply.
 pub(super) const MAX_WAIT: Duration = Duration::from_secs(30);
@@ -63,11 +63,11 @@ impl RateLimiter {
         self.lock().done += steps as f64;
     }
 
-    /// Waits until the rate has allowed all steps that were charged before this call. A later call also waits for the
-    /// steps of earlier calls, so callers proceed in order.
+    /// Waits until the rate has allowed all steps that were charged before this call. A later call waits for at least
+    /// as many steps, so it does not overtake earlier calls.
     ///
     /// # Errors
-    /// [`TooFast`], immediately, if the wait would be longer than `max_wait`.
+    /// [`TooFast`], if the wait would be longer than `max_wait`: at once, or during the wait if the rate is lowered.
     pub(super) async fn acquire(&self, max_wait: Duration) -> Result<(), TooFast> {
         let mut ticket = None;
         while let Some(wait) = self.wait(&mut ticket, max_wait)? {
@@ -130,7 +130,7 @@ impl RateState {
 mod tests {
     use super::*;
 
-    /// A rate limiter with a clock that only waiting advances.
+    /// A rate limiter with a simulated clock, which waiting advances.
     struct Clocked {
         state: RateState,
         now: Instant,
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn what_was_done_is_waited_for_and_a_second_can_be_made_up_for() {
+    fn charged_steps_are_waited_for_and_an_idle_client_may_run_a_burst() {
         let mut clocked = Clocked::new();
         clocked.state.done += 1e6;
         assert_eq!(clocked.turn(), Ok(0.0), "there is no rate");
@@ -178,7 +178,7 @@ mod tests {
     }
 
     #[test]
-    fn those_who_wait_go_one_after_the_other_at_the_rate() {
+    fn waiting_sessions_take_turns_at_the_rate() {
         const ROUNDS: usize = 50;
         let mut clocked = Clocked::new();
         clocked.set_rate(1000);
@@ -206,7 +206,7 @@ mod tests {
     }
 
     #[test]
-    fn who_is_half_a_minute_ahead_is_refused() {
+    fn a_wait_of_more_than_half_a_minute_is_refused() {
         let mut clocked = Clocked::new();
         clocked.set_rate(10);
         clocked.state.done += 400.0;
@@ -216,7 +216,7 @@ mod tests {
     }
 
     #[test]
-    fn another_rate_counts_for_those_who_wait_already() {
+    fn a_new_rate_applies_to_waiting_requests() {
         let mut clocked = Clocked::new();
         clocked.set_rate(10);
         clocked.state.done += 200.0;

@@ -8,7 +8,8 @@ use std::fmt;
 #[derive(Debug, Clone, PartialEq)]
 pub struct TokenRole {
     pub(super) name: String,
-    /// A session may only draw from within the union of these sets; `None` for anywhere.
+    /// The sets that a session may draw from: each box of its region must be inside a box of one of these sets. `None`
+    /// for no limit.
     pub(super) draws: Option<Vec<DrawSet>>,
     /// A session may not draw from a region that overlaps any of these sets.
     pub(super) never: Vec<DrawSet>,
@@ -17,7 +18,7 @@ pub struct TokenRole {
 /// A named set of parameter values.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum DrawSet {
-    /// The values of a version (D, R or E), in every environment.
+    /// The values of a version (D, R, E or R+E), in every environment.
     Version(Version),
     /// A set that the token file defines for one environment.
     Own { name: String, environment: &'static str, region: Region },
@@ -54,8 +55,8 @@ impl TokenRole {
     /// # Errors
     /// The reason, as a part of a sentence, if the sessions may not draw from the region.
     pub fn check(&self, spec: &EnvironmentSpec, region: &Region) -> Result<(), String> {
-        // The sets are regions without disturbances. A session with disturbances is compared with the same sets, so it
-        // cannot circumvent `never`.
+        // The regions of versions are computed without disturbances, and `overlaps` ignores a disturbance that only one
+        // of two regions has. Otherwise a session with a disturbance could circumvent `never`.
         let spec = disturbance::undisturbed(spec);
         let overlaps = |set: &&DrawSet| set.region(spec).is_some_and(|never| region.overlaps(&never));
         if let Some(never) = self.never.iter().find(overlaps) {

@@ -29,7 +29,8 @@ pub struct Resources {
 pub fn resources() -> io::Result<Resources> {
     let stat = fs::read_to_string("/proc/self/stat")?;
     let system = fs::read_to_string("/proc/stat")?;
-    let descriptors = fs::read_dir("/proc/self/fd")?.count().saturating_sub(1); // excludes the descriptor of this directory itself
+    // The descriptor of this directory itself is not counted.
+    let descriptors = fs::read_dir("/proc/self/fd")?.count().saturating_sub(1);
     parse(&stat, &system, descriptors)
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "/proc/self/stat or /proc/stat has another format"))
 }

@@ -18,9 +18,10 @@ const WINDOW: Duration = Duration::from_secs(1);
 pub const GONE: &str = "gone";
 /// Logged ending of a session that its client closed.
 pub const CLOSED: &str = "closed";
-/// Logged ending of a session that sent requests which cannot be decoded.
+/// Logged ending of a session whose stream broke: its bytes cannot be decoded, the connection failed, or the server has
+/// a defect.
 pub const BROKEN: &str = "broken";
-/// Logged ending of a session whose lease expired. All other endings are words of error classes
+/// Logged ending of a session whose lease expired. Endings other than these four are words of error classes
 /// ([`ErrorKind::reason`](crate::server::error::ErrorKind::reason)).
 pub const LEASE_OVER: &str = "lease_over";
 

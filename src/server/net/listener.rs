@@ -102,7 +102,7 @@ impl Listener {
         }
     }
 
-    /// Returns the address at which this listens. If port 0 was given, it has the port that the system chose.
+    /// Returns the address at which this listens. If port 0 was given, the address has the port that the system chose.
     ///
     /// # Errors
     /// If the operating system does not report the port.
@@ -112,6 +112,7 @@ impl Listener {
             Self::Unix(_, file) => Ok(ListenAddress::Unix(file.path.clone())),
         }
     }
+
     /// Waits for the next connection. Switches off Nagle's algorithm for TCP, because a step is one small message each
     /// way.
     ///

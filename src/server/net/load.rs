@@ -17,9 +17,9 @@ const BYTES_PER_UNIT: usize = 16 << 10;
 /// The minimum work that is expected of a new connection, in units: its handshake.
 const HANDSHAKE_WORK: f64 = 16.0;
 
-/// The work of one transport thread, written by that thread only. One unit of work is a read or write that moved data,
-/// plus a unit for each 16 KiB. Steps that run on the thread itself, for up to 80 µs each, are not counted. CPU time
-/// would be a wrong measure, because sessions spin while they wait.
+/// The work of one transport thread, written by that thread only, and its number of connections. A read or write that
+/// moved data counts as one unit of work, and one more for each 16 KiB. Steps that run on the thread itself, for up to
+/// 80 µs each, are not counted. CPU time would be a wrong measure, because sessions spin while they wait.
 #[derive(Default)]
 pub struct ThreadLoad {
     work: AtomicU64,
@@ -94,8 +94,8 @@ impl Balance {
     }
 
     /// Chooses the thread with the least recent work, and among equal threads the thread with the fewest connections.
-    /// Returns the index of the thread, and the counter of the new connection's work. The new connection counts as
-    /// average recent work at once, so simultaneous connections are spread over the threads.
+    /// Returns the index of the thread, and the counter of the new connection's work. The thread's recent work
+    /// immediately rises by the average of a connection, so simultaneous connections are spread over the threads.
     pub fn choose(&mut self, now: Instant) -> (usize, ConnectionLoad) {
         self.refresh(now);
         let connections: usize = self.threads.iter().map(|thread| thread.load.connections()).sum();
@@ -161,7 +161,7 @@ mod tests {
     }
 
     #[test]
-    fn connections_of_one_moment_are_spread() {
+    fn simultaneous_connections_are_spread() {
         let mut clocked = Clocked::new(4);
         (0..64).for_each(|_| _ = clocked.connect());
         assert_eq!(clocked.connections(), [16; 4]);

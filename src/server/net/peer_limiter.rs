@@ -55,7 +55,7 @@ struct PermitCounts {
 pub enum LimitReached {
     /// The limit on all peers together.
     All(usize),
-    /// The limit on the single peer.
+    /// The limit on each peer.
     Peer(usize),
 }
 
@@ -74,7 +74,7 @@ impl PeerLimiter {
     /// Takes a permit for a peer. An unknown peer (`None`) is only subject to the total limit.
     ///
     /// # Errors
-    /// [`LimitReached`], if all permits are in use.
+    /// [`LimitReached`], if all permits, or all permits of this peer, are in use.
     pub fn acquire(&self, peer: Option<Peer>) -> Result<PeerPermit, LimitReached> {
         let mut in_use = self.lock();
         let (total, by_peer) = &mut *in_use;
@@ -145,7 +145,7 @@ mod tests {
     }
 
     #[test]
-    fn a_peer_takes_its_own_places_and_no_more() {
+    fn a_peer_gets_its_own_permits_and_no_more() {
         let [one, other] = [1, 2].map(|user| Some(Peer::User(Some(user))));
         let limiter = PeerLimiter::new(4, 2);
         let [first, _second] = [limiter.acquire(one), limiter.acquire(one)].map(Result::unwrap);

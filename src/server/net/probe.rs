@@ -22,7 +22,7 @@ pub enum Error {
     /// The path of the Unix socket is relative, and the working directory no longer exists.
     #[error("a relative path of a socket: {0}")]
     Directory(#[from] io::Error),
-    /// The server did not answer, or it does not accept sessions.
+    /// The server did not answer or does not accept sessions, or the certificate cannot be read.
     #[error("no server answers at {address}: {reason}")]
     NoAnswer {
         /// The address.
@@ -76,7 +76,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_server_that_listens_everywhere_is_reached_at_home() {
+    fn a_server_on_all_interfaces_is_reached_over_loopback() {
         for (listen, expected) in [
             ("tcp://0.0.0.0:7", "http://127.0.0.1:7"),
             ("tcp://[::]:7", "http://[::1]:7"),

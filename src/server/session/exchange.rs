@@ -51,7 +51,7 @@ pub(super) struct Exchange<H: SessionHandler> {
     known_open: Instant,
     /// The steps of the session for which its token has been charged so far.
     charged: u64,
-    /// The price of requests for which its token has not been charged yet, in steps.
+    /// The price of requests for which the session's token has not been charged yet, in steps.
     price: u64,
     /// The final statistics of the session; `None` until it is closed.
     final_stats: Option<SessionStats>,

@@ -135,8 +135,12 @@ impl PendingReservations {
     /// and the value are released when the last of the bytes has been written or dropped. If no reservation is queued,
     /// returns the bytes unchanged.
     pub fn attach<H: Send + 'static>(&self, bytes: Bytes, hold: impl FnOnce() -> H) -> Bytes {
-        let shares = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
-        if shares.is_empty() { bytes } else { Bytes::from_owner(ReservedBytes { bytes, _held: (shares, hold()) }) }
+        let reservations = std::mem::take(&mut *self.0.lock().unwrap_or_else(PoisonError::into_inner));
+        if reservations.is_empty() {
+            bytes
+        } else {
+            Bytes::from_owner(ReservedBytes { bytes, _held: (reservations, hold()) })
+        }
     }
 }
 
@@ -173,7 +177,7 @@ mod tests {
     }
 
     #[test]
-    fn a_share_is_held_until_the_last_of_its_bytes_is_dropped() {
+    fn a_reservation_is_held_until_the_last_of_its_bytes_is_dropped() {
         let (budget, pending_reservations) = (Budget::new(10), PendingReservations::default());
         pending_reservations.push(budget.reserve(10).unwrap());
         let mut sent = pending_reservations.attach(Bytes::from_static(b"reply"), || ());

@@ -1,5 +1,5 @@
-//! Reads the length-prefixed messages of a gRPC stream. Each message's length is checked against the limit that applies
-//! to its stream at this moment, before any of its bytes are stored.
+//! Reads the length-prefixed messages of a gRPC stream. As soon as a message's header has arrived, the message's length
+//! is checked against the limit that applies to its stream at this moment.
 //!
 //! tonic has only one limit for all messages of a service, and decodes them on the transport thread. Therefore
 //! [`raw_body`](super::raw_body) withholds the request bodies of sessions from tonic, and this module reads them.

@@ -13,8 +13,8 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tonic::Status;
 
-/// The maximum number of fields for which a request is decoded on the transport thread, since a hand-over would take
-/// longer.
+/// The maximum number of fields for which a request is decoded on the transport thread, because handing the request to
+/// another thread would take longer.
 const INLINE_DECODE_MAX_FIELDS: usize = 1000;
 /// The maximum number of requests that are decoded at the same time outside the transport threads.
 const MAX_CONCURRENT_DECODES: usize = 2;
@@ -150,7 +150,7 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
             1 => message.split_off(..8),
             2 => varint(&mut message).and_then(|length| message.split_off(..usize::try_from(length).ok()?)),
             5 => message.split_off(..4),
-            // Kinds 3 and 4 are groups, which proto3 does not have.
+            // Wire types 3 and 4 are groups, which proto3 does not have. Types 6 and 7 do not exist.
             kind => {
                 let got = format!("with a field of the encoding's kind {kind}");
                 return Err(PrecheckError::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
@@ -218,7 +218,7 @@ mod tests {
     }
 
     #[test]
-    fn entries_are_counted_whether_or_not_they_stand_in_a_row() {
+    fn entries_are_counted_packed_or_unpacked() {
         let reset = |seeds| proto::Reset { seeds, ..proto::Reset::default() };
         assert_eq!(checked(reset(vec![u64::MAX; 2000]), usize::MAX), Ok(()));
         assert!(refused(reset(vec![1; 2001])).contains("reset.seeds is present more than 2000 times"));
@@ -243,13 +243,13 @@ mod tests {
     }
 
     #[test]
-    fn a_request_comes_once_in_a_message() {
+    fn a_message_may_contain_only_one_request() {
         let twice = [0x12, 0].repeat(2);
         assert!(matches!(check(&twice, SESSION_REQUEST, LIMITS, usize::MAX), Err(PrecheckError::Refused(_))));
     }
 
     #[test]
-    fn many_fields_are_not_counted_at_once_and_many_bytes_are() {
+    fn many_fields_are_not_counted_inline_but_many_bytes_are() {
         let restore = |n| proto::Restore { snapshots: vec![Bytes::new(); n], ..proto::Restore::default() };
         assert_eq!(checked(restore(INLINE_DECODE_MAX_FIELDS), INLINE_DECODE_MAX_FIELDS), Err(PrecheckError::Work));
         let seeds = proto::Reset { seeds: vec![1; 1 << 20], ..proto::Reset::default() };
@@ -258,7 +258,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_well_formed_ends_the_count_and_never_panics() {
+    fn malformed_messages_end_the_count_and_never_panic() {
         let whole = proto::SessionRequest {
             request: Some(Request::Reset(proto::Reset { seeds: vec![300; 3], ..proto::Reset::default() })),
         }

@@ -74,7 +74,8 @@ impl ReadProgress {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the number of unread replies, and restarts their timeout when the client has read one.
+    /// Changes the number of unread replies. Restarts their timeout when the client has read a reply, or when the first
+    /// reply becomes unread.
     fn change(&self, change: impl FnOnce(usize) -> usize) {
         let mut state = self.state();
         let (before, after) = (state.unread, change(state.unread));

@@ -50,7 +50,8 @@ impl<'a, 'input> ModelText<'a, 'input> {
         inertial.filter(|_| self.compiler("inertiafromgeom") != Some("true"))
     }
 
-    /// Whether a geom is a mesh that affects only pictures: it cannot touch anything, and adds no mass to its body.
+    /// Whether a geom is a mesh that affects only pictures and rangefinders: `contype` and `conaffinity` are 0, and it
+    /// adds no mass to its body. Assumes that no `<pair>` declares contacts of such a mesh.
     pub(super) fn affects_only_pictures(self, geom: Node<'a, 'input>) -> bool {
         let is_zero = |key| self.get(geom, key).unwrap_or("1").trim() == "0";
         let is_mesh = self.get(geom, "type") == Some("mesh") && self.get(geom, "mesh").is_some();
@@ -66,8 +67,8 @@ impl<'a, 'input> ModelText<'a, 'input> {
 }
 
 /// Returns a model's text without the unnamed geoms that affect only pictures, and without the named meshes that no
-/// remaining geom uses. The physics stay the same byte for byte. Compilation becomes faster, because meshes take most
-/// of its time.
+/// remaining geom uses. If the model has no rangefinders, the physics stay the same byte for byte. Compilation becomes
+/// faster, because meshes take most of its time.
 ///
 /// # Errors
 /// [`super::Error`] if the text is not XML.

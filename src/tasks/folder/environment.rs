@@ -91,9 +91,10 @@ impl Needs {
 
 /// An environment of a folder.
 ///
-/// A step sets the controls to the action, clipped to their range, and simulates `frame_skip` timesteps. Then the
-/// environment computes health, the terms of the reward, the goal, the observation and the achieved value, in this
-/// order, from the same state.
+/// A step sets the controls to the action, clipped to their range. If the task scales actions, the action is clipped to
+/// ±1 and scaled to this range instead. Then the step simulates `frame_skip` timesteps. Then the environment computes
+/// health, the terms of the reward, the goal, the observation and the achieved value, in this order, from the same
+/// state.
 ///
 /// The physics diverge if MuJoCo raises a warning or a fatal error. Examples of warnings are a bad number and dropped
 /// contacts. The physics also count as diverged if a number of the reward, the observation or the achieved value is not
@@ -168,8 +169,8 @@ impl FolderEnvironment {
         let task = self.task;
         let started = shared::with(&task.template, |shared| {
             let (simulation, numbers) = shared.at(&self.edit, &self.state)?;
-            // The shared simulation may still have the external forces of another environment. They are cleared, so
-            // that no reading contains them. `forward` computes external forces again if a sensor needs them.
+            // The shared simulation may still have the contact forces on bodies (`cfrc_ext`) of another environment.
+            // They are set to 0, so that no reading returns them. `forward` computes them only if a sensor needs them.
             simulation.clear_external_forces();
             simulation.forward()?;
             simulation.state(&mut self.state);

@@ -84,8 +84,10 @@ pub(super) fn read(files: &mut Files) -> Result<FolderTask> {
     let main = top.require("model", "\"robot.xml\"")?.text()?;
     let mut mjcf = mjcf::read(files, main)?;
     // If parameters edit lengths, geoms that affect only pictures are removed from the physics, so that compilation is
-    // faster. They are kept if the file refers to elements by index (`#3`), because removing geoms changes indices.
-    if edits_lengths(&top) && !text.contains("\"#") && !text.contains("'#") {
+    // faster. They are kept if the file refers to elements by index (`#3`), because removing geoms changes indices. They
+    // are also kept if the model has rangefinders, which measure the distance to geoms of every kind.
+    let refers_by_index = text.contains("\"#") || text.contains("'#");
+    if edits_lengths(&top) && !refers_by_index && !mjcf.physics.xml.contains("<rangefinder") {
         mjcf.physics = attributes::without_visual_geoms(&mjcf.physics)?;
         mjcf.lacks_visual_geoms = true;
     }

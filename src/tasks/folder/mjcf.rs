@@ -14,7 +14,7 @@ use std::{collections::BTreeMap, fmt::Write};
 
 /// Maximal nesting depth of elements. The limit bounds the recursion of MuJoCo and of this module.
 const MAX_DEPTH: usize = 200;
-/// Maximal total of elements, attributes and text nodes in one file.
+/// Maximal number of XML nodes in one file: elements, texts and comments. Attributes do not count.
 const MAX_NODES: u32 = 2_000_000;
 /// Maximal number of elements of a composite. Nearly every element has at least one degree of freedom, so a larger
 /// composite would exceed the limit of degrees of freedom anyway, but only after minutes of compilation.

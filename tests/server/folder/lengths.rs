@@ -326,3 +326,25 @@ fn geoms_that_only_pictures_show_change_no_byte() {
         assert_is(environment.as_mut(), &edited, &format!("a size of {scale}"));
     }
 }
+
+#[test]
+fn rangefinders_measure_geoms_that_only_pictures_show() {
+    let shell = "<asset><mesh name=\"shell\" vertex=\"0 0 0 1 0 0 0 1 0 0 0 1\"/></asset>";
+    let shown = r#"<geom type="mesh" mesh="shell" contype="0" conaffinity="0"/><inertial pos="0 0 0.4" mass="0.5" diaginertia="0.04 0.04 0.01"/>"#;
+    let model = CART
+        .replace("<worldbody>", &format!("{shell}<worldbody><site name=\"high\" pos=\"0.3 0.3 3\" zaxis=\"0 0 -1\"/>"))
+        .replace("<joint name=\"hinge\"", &format!("{shown}<joint name=\"hinge\""))
+        .replace("</mujoco>", "<sensor><rangefinder name=\"range\" site=\"high\"/></sensor></mujoco>");
+    let task = TASK.replace("observation = [", "observation = [{ sensor = \"range\" }, ");
+    let size = parameter("size", "{ body = \"pole\", field = \"size\", by = \"scale\" }", (0.5, 1.0, 2.0));
+    let range = |name: &str, parameters: &[String]| {
+        let mut environment = with_parameters(&task, ("cart.xml", &model), name, parameters);
+        environment.reset(&mut PhiloxStream::new(4, 0, DrawPurpose::InitialState, 0));
+        let mut observation = vec![0.0; environment.spec().observation.len()];
+        environment.observe(&mut observation);
+        observation[0]
+    };
+    let plain = range("CartWithRangefinder", &[]);
+    assert!((2.4..2.8).contains(&plain), "the ray ends at the mesh after {plain} m");
+    assert_eq!(range("CartWithRangefinderAndSize", &[size]), plain);
+}

@@ -51,7 +51,7 @@ fn what_is_no_page_says_where_it_is(#[case] line: &str, #[case] status: &str, #[
 #[rstest]
 #[case::other_machines(&["--metrics", "tcp://0.0.0.0:0"], &["tcp://0.0.0.0:0 of --metrics can be reached", "--insecure"])]
 #[case::guarded(&["--metrics", "tcp://[::]:0", "--tokens", "x"], &["tcp://[::]:0 of --metrics can be reached"])]
-#[case::no_address(&["--metrics", "http://localhost"], &["no address to listen at"])]
+#[case::no_address(&["--metrics", "http://localhost"], &["is not an address to listen at"])]
 #[case::no_folder(&["--metrics", "unix:/nowhere/metrics"], &["its folder does not exist", "correct --metrics"])]
 fn a_wrong_address_is_refused_before_anything_is_served(#[case] flags: &[&str], #[case] parts: &[&str]) {
     let mut command = command();

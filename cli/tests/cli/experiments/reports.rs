@@ -259,19 +259,19 @@ fn heatmaps_of_an_experiment_are_made_once() {
     let out = experiment.out("out");
     let without = experiment.page("out");
     assert!(embedded(&without).is_empty());
-    assert!(without.contains("not there: 8 of 8. <code>perturb heatmap DIR</code> makes them"));
+    assert!(without.contains("Missing heatmaps: 8 of 8. <code>perturb heatmap DIR</code> makes them"));
 
     // There are eight heatmaps, of policies that were trained in two environments on D and on E, in two runs. The
     // better of two configurations is selected.
     assert_eq!(made(&experiment, &["--runs", "1"]), (4, 0));
     let partial = experiment.page("out");
     assert_eq!(embedded(&partial).len(), 2, "one of each environment");
-    assert!(partial.contains("not there: 4 of 8.") && partial.contains("1 of 2 runs trained on E"));
+    assert!(partial.contains("Missing heatmaps: 4 of 8.") && partial.contains("1 of 2 runs trained on E"));
     assert_eq!(made(&experiment, &[]), (4, 4));
     assert_eq!(made(&experiment, &[]), (0, 8), "made once");
     let with = experiment.page("out");
     assert!(embedded(&with).len() == 2 && with.matches("; 2 runs trained on E").count() == 2);
-    assert!(!with.contains("not there") && !with.contains("src=") && !with.contains("<script"));
+    assert!(!with.contains("Missing heatmaps") && !with.contains("src=") && !with.contains("<script"));
     assert_eq!(with, experiment.page("out"), "the same folder, the same bytes");
     let first = heatmap_files(&out);
     assert_eq!(first.len(), 24, "two files and a record of each");
@@ -284,10 +284,10 @@ fn heatmaps_of_an_experiment_are_made_once() {
         assert_eq!(text(&picture.with_extension("csv")).lines().count(), 9, "two columns of four points");
     }
 
-    // A heatmap is made again if its file is damaged, or if the result of its cell was replaced.
+    // A heatmap is made again if its file is damaged. It is outdated if the result of its cell was replaced.
     let damaged = first.keys().find(|path| path.extension().is_some_and(|ending| ending == "csv")).expect("one");
     std::fs::write(damaged, b"mass,").expect("written");
-    assert!(experiment.page("out").contains("not there: 1 of 8."));
+    assert!(experiment.page("out").contains("Missing heatmaps: 1 of 8."));
     assert_eq!(made(&experiment, &[]), (1, 7));
     assert_eq!(heatmap_files(&out), first, "the same bytes again");
     let name = damaged.file_stem().expect("a name").to_string_lossy().into_owned();
@@ -337,7 +337,7 @@ fn heatmaps_of_an_experiment_have_any_two_parameters() {
         format!("{pendulum} mass and length, the others drawn from R"),
     ];
     assert_eq!(embedded(&page), expected, "every pair that is there");
-    assert!(!page.contains("not there"));
+    assert!(!page.contains("Missing heatmaps"));
 
     let none = experiment.heatmap("out", &["--x", "force", "--y", "colour"]);
     assert_eq!(none.status.code(), Some(1));

@@ -20,7 +20,7 @@ pub struct Cluster {
     daemons: Vec<Child>,
 }
 
-/// Returns the path of a program in PATH, or in Debian's folders for daemons.
+/// Returns the path of a program in PATH, or in /usr/sbin, Debian's folder for daemons.
 fn find(program: &str) -> Option<PathBuf> {
     let path = std::env::var_os("PATH").unwrap_or_default();
     let directories = std::env::split_paths(&path).chain(["/usr/sbin".into()]);

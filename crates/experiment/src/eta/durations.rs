@@ -11,11 +11,13 @@ use crate::plan::{Cell, Plan};
 /// Cells that run together in one process share the time of the process equally.
 #[derive(Debug, Default)]
 pub struct CellDurations<'a> {
-    by_kind: HashMap<(&'a str, Method), Sum>,
+    /// Sums by environment and method.
+    sums: HashMap<(&'a str, Method), Sum>,
+    /// Number of finished cells.
     count: usize,
 }
 
-/// A sum of process times, and their number.
+/// The summed process time of finished cells, and the number of these cells.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sum {
     seconds: f64,
@@ -37,7 +39,7 @@ impl<'a> CellDurations<'a> {
 
     /// Adds a finished cell, which took `seconds` of process time.
     pub(crate) fn add(&mut self, cell: &'a Cell, seconds: f64) {
-        let sum = self.by_kind.entry((&cell.config.common.environment, cell.method())).or_default();
+        let sum = self.sums.entry((&cell.config.common.environment, cell.method())).or_default();
         sum.seconds += seconds;
         sum.count += 1.0;
         self.count += 1;
@@ -46,7 +48,7 @@ impl<'a> CellDurations<'a> {
     /// Returns the mean process time, in seconds, of finished cells with the environment and method of `cell`. Returns
     /// `None` if there are none.
     pub fn seconds(&self, cell: &Cell) -> Option<f64> {
-        let sum = self.by_kind.get(&(cell.config.common.environment.as_str(), cell.method()))?;
+        let sum = self.sums.get(&(cell.config.common.environment.as_str(), cell.method()))?;
         Some(sum.seconds / sum.count)
     }
 
@@ -62,7 +64,7 @@ mod tests {
     use crate::Timing;
 
     #[test]
-    fn durations_of_finished_cells_are_averaged_by_kind() {
+    fn durations_of_finished_cells_are_averaged_by_environment_and_method() {
         let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3
             [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
         let plan = Plan::parse("test", text.into()).unwrap();

@@ -7,9 +7,11 @@
 /// Number of recent episodes over which the episode length is averaged. An average over fewer episodes would vary too
 /// much.
 const RECENT_EPISODES: f64 = 100.0;
-/// Minimum share (0 to 1) of a training's steps that must be done before the remaining steps are estimated.
+/// Minimum share (0 to 1) of this process's steps, done and remaining, that must be done before the remaining steps are
+/// estimated.
 const MIN_SHARE: f64 = 0.01;
-/// Episodes count as growing if the mean length of recent episodes exceeds the mean length of all by this factor.
+/// Episodes count as growing if the mean length of recent episodes is more than this factor times the mean length of
+/// all episodes of this process.
 const GROWTH_FACTOR: f64 = 1.3;
 /// Share of the budget (0 to 1) up to which growing episodes make the estimate a lower bound.
 const EARLY_SHARE: f64 = 0.25;
@@ -108,7 +110,8 @@ mod tests {
         progress.update(502.0, 50_000 + 2 * 1000);
         let after = progress.remaining_ratio(2000.0).unwrap();
         assert!((before - 3.0).abs() < 1e-9 && (1.0..1.2).contains(&(after / before)), "{before}, then {after}");
-        // If episodes stay twice as long, the average reaches their length, also with frequent updates.
+        // Later episodes have 200 steps, twice the former length. The average reaches 200, although every update adds
+        // only two episodes.
         (1..=200).for_each(|i| progress.update(502.0 + 2.0 * f64::from(i), 52_000 + 400 * i as u64));
         let length = progress.remaining_ratio(2000.0).unwrap() * 132_000.0 / (2000.0 - 902.0);
         assert!((190.0..=210.0).contains(&length), "{length}");

@@ -38,15 +38,15 @@ pub(crate) fn remaining_time(
     at_a_time: usize,
 ) -> Option<RemainingTime> {
     let under_way = cells.iter().filter(|cell| cell.elapsed_seconds.is_some()).count();
-    // Cells of one group run in one process and share its time. So the process time of a running cell is this share (0
-    // to 1) of its elapsed time.
+    // Cells of one group run in one process and share its time. So the process time of a running cell is its elapsed
+    // time, multiplied by the number of processes per running cell (at most 1).
     let share = (at_a_time as f64 / under_way.max(1) as f64).min(1.0);
-    let kind = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
+    let key = |cell: &'_ Cell| (cell.config.common.environment.clone(), cell.method());
     // Sum and number of the expected durations of running cells, by environment and method.
     let mut running: HashMap<(String, Method), (f64, f64)> = HashMap::new();
     for one in cells {
         if let (Some(elapsed), Some(ratio)) = (one.elapsed_seconds, one.remaining_ratio) {
-            let (sum, count) = running.entry(kind(one.cell)).or_default();
+            let (sum, count) = running.entry(key(one.cell)).or_default();
             (*sum, *count) = (*sum + elapsed * share * (1.0 + ratio), *count + 1.0);
         }
     }
@@ -57,7 +57,7 @@ pub(crate) fn remaining_time(
         let rest = if let Some(ratio) = one.remaining_ratio {
             elapsed * share * ratio
         } else {
-            let of_running = || running.get(&kind(one.cell)).map(|(sum, count)| sum / count);
+            let of_running = || running.get(&key(one.cell)).map(|(sum, count)| sum / count);
             let expected = durations.seconds(one.cell).or_else(of_running).or_else(|| {
                 at_most |= one.max_seconds.is_some();
                 one.max_seconds
@@ -95,7 +95,7 @@ mod tests {
     }
 
     #[test]
-    fn waiting_cells_take_the_mean_of_their_kind() {
+    fn waiting_cells_take_the_mean_of_their_environment_and_method() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
         let mut times = CellDurations::default();
@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn running_cells_predict_waiting_cells_of_their_kind() {
+    fn running_cells_predict_waiting_cells_of_their_environment_and_method() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
         let times = CellDurations::default();
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn measured_maxima_fill_in_for_kinds_that_have_not_begun() {
+    fn measured_maxima_are_used_for_methods_without_running_or_finished_cells() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let waits = |max_seconds| UnfinishedCell {
             cell: &plan.cells[3],

@@ -191,14 +191,14 @@ fn place_of(error: &ConfigError, name: &str, block: &Block, common: &Table) -> S
     }
 }
 
-/// Returns a hash of settings and tests as eight hexadecimal digits. Environment, version and seed are left out of the
-/// hash.
+/// Returns a hash of settings and tests as eight hexadecimal digits. Environment and seed are left out of the hash. The
+/// version is left out unless the policy is trained on a parameter set.
 fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     let mut table = config.table();
     table.remove("environment");
     table.remove("seed");
-    // A cell's id contains the version, or only the name of a parameter set. The parameters of a set must therefore be
-    // in the hash.
+    // A cell's id names the version or the parameter set. The name of a set does not determine its parameters and its
+    // version, so both stay in the hash.
     if config.common.parameters.is_empty() {
         table.remove("version");
     }

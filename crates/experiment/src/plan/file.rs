@@ -15,7 +15,8 @@ use toml::{Spanned, Table};
 use super::SELECTION_TEST;
 use super::{Selection, distinct};
 
-/// Settings that `[settings]` and grids must not contain, because other keys of the plan determine them.
+/// Settings that `[settings]`, `[algorithm.settings]` and `[algorithm.grid]` must not contain, because other keys of
+/// the plan determine them.
 const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
 /// Maximum number of cells of a plan.
 const MAX_CELLS: usize = 1_000_000;
@@ -246,7 +247,7 @@ impl File {
         (self.selection == Selection::Clean).then(|| self.selection_episodes.unwrap_or(self.test_episodes))
     }
 
-    /// Checks all keys except the tables `[[algorithm]]`.
+    /// Checks all keys except `tasks`, `sets`, `settings` and the tables `[[algorithm]]`.
     pub(super) fn check(&self) -> Result<(), ValueError> {
         let most = i64::MAX as u64 - 2 * u64::from(u32::MAX);
         require(self.runs > 0, "runs", self.runs, "at least 1")?;
@@ -274,7 +275,8 @@ impl File {
         }
     }
 
-    /// Checks the keys that belong to `selection = "clean"`.
+    /// Checks the keys that belong to `selection = "clean"`. With this rule, no parameter set may have the name of the
+    /// selection test.
     fn check_selection(&self) -> Result<(), ValueError> {
         for (key, given) in
             [("tuning_runs", self.tuning_runs.map(u64::from)), ("selection_episodes", self.selection_episodes)]
@@ -289,8 +291,9 @@ impl File {
         require(is_free, key, format!("`{SELECTION_TEST}`"), "another name: the test that selects has this one")
     }
 
-    /// Checks all keys of `block` except the values of its grid. Errors refer to the block as `name`. `before` is the
-    /// number of cells from earlier blocks.
+    /// Checks the lists of `block`, the keys of all settings, and the number of cells. The values of settings and of
+    /// the grid are not checked. Errors refer to the block as `name`. `before` is the number of cells from earlier
+    /// blocks.
     pub(super) fn check_block(&self, name: &str, block: &Block, before: usize) -> Result<(), ValueError> {
         let environments = self.environments_of(block);
         let key = format!("{name}: environments");

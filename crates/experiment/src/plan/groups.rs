@@ -1,8 +1,9 @@
-//! Divides cells into groups, which one process each trains together.
+//! Divides cells into groups. One process trains the cells of a group together.
 //!
 //! The cells of a group have the same environment, architecture and kind of observation, so their steps can be one
-//! batch. All cells that share a batch wait for the slowest one, so cells with short, long and no rollouts are in
-//! separate groups. A cell's result does not depend on its group.
+//! batch. All cells that share a batch wait for the slowest one, so cells with different [collection
+//! modes](CollectionMode) are in separate groups. Cells with disturbances are in separate groups too. A cell's result
+//! does not depend on its group.
 
 use std::ops::Range;
 

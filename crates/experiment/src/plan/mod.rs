@@ -54,7 +54,7 @@ pub struct Plan {
     /// are selected by the reported tests.
     pub tuning_runs: u32,
     /// The cells to run. With `selection = "clean"` these are the tuning cells, until [`Plan::with_selected_cells`]
-    /// appends the selected ones. A cell's index is its position in this list.
+    /// appends the selected ones.
     pub cells: Vec<Cell>,
     /// Cells that [`Plan::with_selected_cells`] appends to `cells` if their configuration is selected.
     pub candidates: Vec<Cell>,
@@ -97,12 +97,14 @@ impl std::str::FromStr for Selection {
 /// A cell of the experiment: one training and its tests.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Cell {
-    /// The index in the plan, from 0.
+    /// The position, from 0, in the list of [`Plan::cells`] followed by [`Plan::candidates`], as the file expands to
+    /// them. Appending a selected candidate to `cells` does not change its index.
     pub index: usize,
     /// The cell's name: environment, algorithm, architecture, training version, configuration and seed. It depends on
     /// nothing else in the plan, so the cell's results stay valid when other cells are added.
     pub id: String,
-    /// A hash of settings and tests in eight hexadecimal digits. Environment, version and seed are left out.
+    /// A hash of settings and tests in eight hexadecimal digits. Environment and seed are left out. The version is left
+    /// out unless the policy is trained on a parameter set.
     pub configuration: String,
     /// The number of the run, from 1. Tuning runs are numbered separately.
     pub run: u32,
@@ -122,7 +124,8 @@ pub struct Cell {
 pub struct Tests {
     /// Number of episodes in each test.
     pub episodes: u64,
-    /// The test sets: versions in the order D, R, E, R+E, then the plan's parameter sets in the plan's order.
+    /// The test sets: versions in the order D, R, E, R+E, then parameter sets in the order of the file's
+    /// `test_versions`.
     pub sets: Vec<TestSet>,
     /// Number of episodes of the separate selection test on the training distribution; `None` if configurations are
     /// selected by the reported tests.
@@ -148,7 +151,7 @@ pub struct Counts {
     pub pairs: usize,
     /// Number of train/test pairs in all runs.
     pub all_pairs: usize,
-    /// Number of runs, or of tuning runs with `selection = "clean"`.
+    /// Number of runs. With `selection = "clean"`, number of tuning runs.
     pub runs: u32,
 }
 
@@ -323,11 +326,13 @@ impl Plan {
     }
 
     /// Returns whether configurations must be selected: whether some method has several configurations in the same
-    /// environment on the same training version.
+    /// environment on the same training distribution.
     pub fn selects(&self) -> bool {
-        let place = |cell: &&Cell| (cell.config.common.environment.clone(), cell.method(), cell.config.common.version);
-        let places = distinct(self.cells.iter().map(|cell| place(&cell))).len();
-        distinct(self.cells.iter().map(|cell| (place(&cell), &cell.configuration))).len() > places
+        fn place(cell: &Cell) -> (&str, Method, TrainedOn<'_>) {
+            (&cell.config.common.environment, cell.method(), cell.trained_on())
+        }
+        let places = distinct(self.cells.iter().map(place)).len();
+        distinct(self.cells.iter().map(|cell| (place(cell), &cell.configuration))).len() > places
     }
 }
 
@@ -362,7 +367,8 @@ pub fn distinct<T: Eq + std::hash::Hash + Clone>(items: impl Iterator<Item = T>)
     items.filter(|item| seen.insert(item.clone())).collect()
 }
 
-/// Returns the message of a TOML error in words for users. Suggests the key that was probably meant.
+/// Returns the message of a TOML error in words for users. For an unknown key, suggests the key that was probably
+/// meant.
 fn words(error: &toml::de::Error) -> String {
     let whole = "expected a whole number that is not negative, in digits";
     let text = ["expected u32", "expected u64"]

@@ -45,7 +45,7 @@ fn a_file_expands_to_the_product_of_its_lists() {
 }
 
 #[test]
-fn names_are_spelled_as_one_likes_and_cells_are_the_same() {
+fn another_spelling_of_names_gives_the_same_cells() {
     let plan = parse(SMALL).unwrap();
     let ids = |plan: &Plan| plan.cells.iter().map(|cell| cell.id.clone()).collect::<Vec<_>>();
     let text = SMALL
@@ -123,7 +123,7 @@ fn an_id_names_a_cell_whatever_else_the_plan_has() {
     assert_eq!(plan.find("104"), None);
 }
 
-/// The order of `test_versions` and of other lists without a meaningful order does not affect cell ids.
+/// The order of versions in `test_versions`, and of other lists without a meaningful order, does not affect cell ids.
 #[test]
 fn the_order_of_a_list_without_order_changes_no_id() {
     let with = |versions: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\ntest_versions = {versions}"), 1));
@@ -171,13 +171,14 @@ fn r_plus_e_is_a_version_and_keeps_other_ids() {
 }
 
 #[test]
-fn a_choice_is_between_configurations_of_one_method_on_the_same() {
+fn selection_needs_several_configurations_of_one_method_in_one_environment() {
     let each = "environments = ['CartPole', 'Pendulum']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
     let two = format!(
         "{each}\nenvironments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n\
                        environments = ['Pendulum']\nsettings = {{ n_steps = 9 }}"
     );
-    for (text, selects) in [(SMALL, true), (each, false), (&two, false)] {
+    let with_set = format!("versions = ['D', 'mine']\n{each}\n[sets.mine]\nlength = '0.4..0.6'");
+    for (text, selects) in [(SMALL, true), (each, false), (&two, false), (&with_set, false)] {
         assert_eq!(parse(text).unwrap().selects(), selects, "{text}");
     }
 }
@@ -253,7 +254,7 @@ fn an_invalid_plan_is_refused_with_its_key() {
 }
 
 #[test]
-fn marks_are_those_before_the_end_and_name_another_cell() {
+fn marks_are_below_the_budget_and_change_cell_ids() {
     let with =
         |marks: &str| parse(&SMALL.replacen("runs = 2", &format!("runs = 2\nevaluate_at = {marks}"), 1)).unwrap();
     let plan = with("[5, 20, 50]");
@@ -347,7 +348,7 @@ fn cells_of_the_usual_preset_keep_their_names() {
 }
 
 #[test]
-fn a_plan_that_nobody_can_do_is_refused_before_it_is_expanded() {
+fn a_plan_with_too_many_cells_is_refused_before_it_is_expanded() {
     let values: Vec<String> = (1..=100).map(|number| format!("{number}e-6")).collect();
     let values = values.join(", ");
     let text = format!(

@@ -13,7 +13,7 @@ use crate::folder::{CellResult, CellState, ExperimentFolder, FolderError};
 use crate::plan::{Cell, Plan};
 use crate::scheduler::{Rate, Rates};
 
-/// Maximum number of cells of an experiment that [`ExperimentStatus::read_within`] reads.
+/// Maximum number of cells in a plan that [`ExperimentStatus::read_within`] accepts.
 const MAX_FOLLOWED_CELLS: usize = 50_000;
 /// The error text for a symbolic link to a file outside the shown folder.
 pub const LEADS_OUT: &str = "a link that leads out of the folder";
@@ -42,7 +42,7 @@ pub enum CellStatus {
     Done(Box<CellResult>),
     /// The cell failed with this reason.
     Failed(String),
-    /// The cell's files cannot be read.
+    /// The cell's files cannot be read, for this reason.
     NotUnderstood(String),
     /// A process is working on the cell: its folder is locked.
     InWork,
@@ -67,8 +67,8 @@ impl ExperimentStatus {
         Self::with(path, None)
     }
 
-    /// Reads the status of an experiment that is shown to others. Does not read files outside `root`, even if symbolic
-    /// links lead there. `path` must be in `root` and contain no links.
+    /// Reads the status of an experiment that is shown to other users. Does not follow symbolic links to files outside
+    /// `root` or to hidden files in `root`. `path` must be in `root` and contain no links.
     ///
     /// # Errors
     /// An error if the plan cannot be read, is behind a link that leads out of `root`, or has too many cells.
@@ -318,18 +318,18 @@ mod tests {
         assert_eq!(status.state(), "finished");
         std::fs::remove_dir_all(places[0].path()).unwrap();
         status.refresh().unwrap();
-        assert_eq!(status.cells[0], CellStatus::Waiting { begun: false }, "results may go, too");
+        assert_eq!(status.cells[0], CellStatus::Waiting { begun: false }, "results may be deleted");
         places[1].write_result(&fixture::result(&plan.cells[1], [10.0, 20.0, 30.0], 1.0)).unwrap();
         status.refresh().unwrap();
         let again = |known: &CellStatus| matches!(known, CellStatus::Done(result) if result.results["D"].success_percent == 10.0);
-        assert!(again(&status.cells[1]), "results may be others, too");
+        assert!(again(&status.cells[1]), "results may be replaced");
         std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 2")).unwrap();
         status.refresh().unwrap();
         assert_eq!(status.cells.len(), 2, "another plan");
     }
 
     #[test]
-    fn what_is_shown_to_others_is_nothing_that_links_lead_out_to() {
+    fn links_out_of_the_root_are_not_shown_to_others() {
         let directory = tempfile::tempdir().unwrap();
         let outside = directory.path().join("outside.json");
         std::fs::write(&outside, "{\"secret\": 7}").unwrap();
@@ -350,7 +350,7 @@ mod tests {
         };
         let shown = read(true);
         assert!(reason(&shown).ends_with("result.json is a link that leads out of the folder"));
-        assert!(reason(&read(false)).contains("secret"), "who asks for it reads it");
+        assert!(reason(&read(false)).contains("secret"), "only `read_within` refuses links");
         std::fs::rename(folder.plan_path(), directory.path().join("plan")).unwrap();
         std::os::unix::fs::symlink(directory.path().join("plan"), folder.plan_path()).unwrap();
         let error = ExperimentStatus::read_within(folder.path(), &root).unwrap_err().to_string();

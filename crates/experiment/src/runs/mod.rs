@@ -66,15 +66,15 @@ pub struct RunFolders {
     pub runs: Vec<RunFolder>,
     /// All other searched folders, including the one where the search starts if it is no run itself.
     pub others: Vec<PathBuf>,
-    /// Symbolic links that were not followed because they lead out of the folder `within`.
+    /// Symbolic links that were not followed because they lead out of the folder `within`, or to a hidden folder in it.
     pub links_out: Vec<PathBuf>,
     /// Whether the search stopped at its maximum number of folders, so that runs may be missing.
     pub more: bool,
 }
 
 /// Finds runs in `folder` and its subfolders. Searches at most `most` folders, each once. Follows symbolic links after
-/// it has searched all other folders. If `within` is given, does not follow links that lead out of this folder.
-/// `within` must be an absolute path without links.
+/// it has searched all other folders. If `within` is given, does not follow links that lead out of this folder or to a
+/// hidden folder in it. `within` must be an absolute path without links.
 ///
 /// # Errors
 /// Errors of the operating system if `folder` itself cannot be listed. Skips other folders that cannot be listed.

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use perturb_files::open_plain;
 
-/// Maximum size of a line, including the header, in bytes.
+/// Maximum length in bytes of the header and of every other line.
 const MAX_LINE_BYTES: u64 = 16 * 1024;
 
 /// The last line of a `progress.csv`: the progress of a training and the statistics of its last update.
@@ -30,8 +30,8 @@ impl LastProgress {
     }
 }
 
-/// Reads the last complete line of the file at `path`. Returns `None` if there is none. Only the beginning and the end
-/// of the file are read, so large files are fast too.
+/// Reads the last complete line of the file at `path`. Returns `None` if there is none, or if its number of columns
+/// differs from the header's. Only the beginning and the end of the file are read, so large files are fast too.
 pub fn last_progress(path: &Path) -> Option<LastProgress> {
     let (mut file, metadata) = open_plain(path).ok()?;
     let length = metadata.len();

@@ -119,7 +119,7 @@ mod tests {
         let config = "environment = 'CartPole'\nalgorithm = 'a2c'\nepisodes = 200";
         write("config.toml", &format!("{config}\nstop_at_success = 25"));
         let status = read();
-        assert!(status.over && status.state == "in work", "what it has become may be tested now");
+        assert!(status.over && status.state == "in work", "its policy may be in tests now");
         write("config.toml", config);
         drop(lock);
         write("checkpoint/checkpoint.json", "{");

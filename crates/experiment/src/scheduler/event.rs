@@ -96,8 +96,8 @@ impl CellEvent {
         !matches!(self, Self::Server { .. } | Self::Training { .. } | Self::Testing { .. })
     }
 
-    /// Returns a value that identifies the stage of a progress event: a test set, or the training up to the next
-    /// checkpoint. Returns `None` for other events.
+    /// Returns a value that identifies the stage of a `Training` or `Testing` event: the training up to the next
+    /// checkpoint, or a test set. Returns `None` for other events.
     fn stage(&self) -> Option<(&str, u64)> {
         match self {
             Self::Training { saved, .. } => Some(("", *saved)),
@@ -140,8 +140,8 @@ impl<W: Write> EventLineWriter<W> {
         Self { out, interval: INTERVAL * intervals, last: HashMap::new() }
     }
 
-    /// Writes an event of the cell with this id. Skips a progress event if an event of the same stage was written
-    /// within the interval.
+    /// Writes an event of the cell with this id. Skips a `Training` or `Testing` event if the cell's last written event
+    /// is of the same stage and more recent than the interval.
     pub fn write(&mut self, cell: &str, event: CellEvent) {
         let is_recent =
             |(last, time): &(CellEvent, Instant)| time.elapsed() < self.interval && last.stage() == event.stage();
@@ -249,7 +249,7 @@ mod tests {
     }
 
     #[test]
-    fn of_many_cells_less_is_said_about_each() {
+    fn progress_is_sent_less_often_with_many_cells() {
         let seconds = |cells| EventLineWriter::new(cells, Vec::new()).interval.as_secs();
         assert_eq!([0, 1, 4, 36].map(seconds), [1, 1, 4, 10]);
     }

@@ -305,7 +305,7 @@ mod tests {
             assert_eq!(
                 job.turn,
                 turn(&ids[0], number),
-                "they go around the servers, also if these are more than workers"
+                "cells take the servers in turn, even if there are more servers than workers"
             );
             let events: Vec<String> = ran.lines.iter().filter(|line| line.cell == *id).map(said).collect();
             assert_eq!(events, [r#"{"event":"server","address":"unix:/x"}"#, r#"{"event":"done"}"#]);
@@ -366,8 +366,8 @@ mod tests {
     fn dead_worker_loses_only_its_running_cells() {
         let (.., ids) = place();
         let [first, second] = &ids;
-        // The worker dies after the first cell. The second cell is started again, and the reason for the worker's end
-        // contains the last line of the log.
+        // The worker dies after the first cell. The second cell is started again. If it had begun, it counts as killed,
+        // and the reason contains the last line of the log.
         let script = format!(
             r#"case "$order" in
                 *{first}*) echo x >result.json; say '"done"'; id={second}; say '"server","address":"unix:/x"'
@@ -375,16 +375,16 @@ mod tests {
                 *) echo x >result.json; say '"done"' ;;
             esac"#
         );
-        for turn in [false, true] {
+        for had_begun in [false, true] {
             let (_directory, folder, _) = place();
-            let script = format!("WORKED={}; {script}", if turn { "1" } else { "" });
+            let script = format!("WORKED={}; {script}", if had_begun { "1" } else { "" });
             let grouping = Grouping { max_cells: 2, at_a_time: 1 };
             let ran = run_grouped(grouping, &folder, &script, &StopFlag::default(), &|| None);
             assert_eq!(ran.end.unwrap(), RunEnd::Finished { failed: Vec::new() });
             let events = ran.lines.iter().map(|line| (&*line.cell, line.event.to_string()));
             let killed = || "its process ended with signal: 9 (SIGKILL): lost".to_owned();
             let mut expected = vec![(&**first, "done".to_owned()), (second, "on unix:/x".to_owned())];
-            if turn {
+            if had_begun {
                 expected.extend([(&**second, "1 test episode on D".to_owned()), (second, killed())]);
             }
             expected.push((second, "done".to_owned()));
@@ -421,7 +421,7 @@ mod tests {
     }
 
     #[test]
-    fn the_end_of_the_shared_server_is_that_of_the_run() {
+    fn the_end_of_the_shared_server_ends_the_run() {
         let (_directory, folder, _) = place();
         let stop = StopFlag::default();
         let ran = run_script(&folder, "cat >/dev/null", &stop, &|| {

@@ -45,7 +45,7 @@ const STABLE_CONNECTION: Duration = Duration::from_secs(60);
 const FIRST_PAUSE: Duration = Duration::from_secs(1);
 /// Maximum pause after an attempt that lost its server or could not read or write a file.
 const MAX_PAUSE: Duration = Duration::from_secs(30);
-/// Interval between reads of the folder, and between progress messages.
+/// Minimum interval between reads of the folder. Each read is followed by a [`ProgressEvent::Status`].
 const POLL_INTERVAL: Duration = Duration::from_secs(1);
 /// Duration of a test episode divided by that of a training episode. Tests have no updates and run many environments
 /// together.
@@ -71,8 +71,8 @@ pub trait Backend {
     fn poll(&mut self, now: Instant) -> Result<Vec<BackendEvent>>;
     /// Returns the number of groups that can start now.
     fn free_slots(&self) -> usize;
-    /// Starts some of `groups`, none of which may be empty. Returns the indices of the cells that are now running or
-    /// queued, including cells that were running or queued before.
+    /// Starts some of `groups`, none of which may be empty. Returns the indices of those offered cells that are now
+    /// running or queued, including cells that an earlier process has queued.
     ///
     /// # Errors
     /// [`RunError`] if the run cannot continue.
@@ -617,8 +617,8 @@ fn pause(in_a_row: u32) -> Duration {
     MAX_PAUSE.min(FIRST_PAUSE * (1 << (in_a_row - 1).min(16)))
 }
 
-/// Returns the remaining work of a running cell divided by the work of the current attempt. `event` is the cell's last
-/// event. Returns `None` if there is no estimate yet.
+/// Returns the remaining work of a running cell divided by the work that the current attempt has done so far. `event`
+/// is the cell's last event. Returns `None` if there is no estimate yet.
 fn rest(cell: &Cell, event: &CellEvent, progress: &TrainingProgress) -> Option<f64> {
     let training = generated_episodes(&cell.config, cell.config.common.episodes);
     let testing = test_episodes(cell, None);

@@ -19,7 +19,7 @@ pub struct Rate {
     pub success: Vec<(String, f64)>,
 }
 
-/// Collects [`Rate`]s in the order of the plan.
+/// Collects [`Rate`]s. The key of a rate is the index in the plan of the first cell that was added to it.
 #[derive(Debug, Default)]
 pub(crate) struct Rates(BTreeMap<usize, (Rate, Vec<f64>)>);
 
@@ -39,7 +39,7 @@ impl Rates {
         }
     }
 
-    /// Returns the rates in the plan's order.
+    /// Returns the rates in the order of their keys.
     pub(crate) fn list(&self) -> Vec<Rate> {
         self.0.values().map(|(rate, _)| rate.clone()).collect()
     }

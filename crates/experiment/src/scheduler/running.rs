@@ -10,7 +10,7 @@ use crate::plan::Cell;
 /// cells of one kind.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct RunningGroup {
-    /// Environment and architecture of the cells.
+    /// Environment and architecture of the cells, with a note if their policies see the parameters.
     pub kind: String,
     /// The ids of the cells, at least one, each with its last event.
     pub cells: Vec<(String, CellEvent)>,

@@ -361,7 +361,7 @@ fn a_loss_after_a_minute_with_a_server_is_counted_from_one(#[case] fifth: Vec<Ac
 }
 
 #[test]
-fn an_earlier_failure_counts_unless_it_is_forgiven() {
+fn an_earlier_failure_counts_unless_it_is_retried() {
     let place = Place::new();
     place.fail(2);
     assert_eq!(place.run(&|_, _| done()).end, place.finished(&[2]));
@@ -438,7 +438,7 @@ fn a_run_whose_jobs_do_not_report_their_ends_sees_the_results() {
 }
 
 #[test]
-fn an_order_that_is_refused_ends_the_run() {
+fn a_refused_job_ends_the_run() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![ends(CellEvent::Refused { reason: "no such cell".into() })]);
     assert!(ran.end.is_err_and(|error| error.starts_with("a worker refused its job: no such cell; did another run")));
@@ -506,7 +506,7 @@ fn group_begins_together_and_settles_singly() {
 }
 
 #[test]
-fn what_is_left_is_grouped_anew() {
+fn unfinished_cells_are_grouped_without_finished_ones() {
     let place = Place::of(GROUPS);
     [0, 1, 4].iter().for_each(|&cell| place.write(cell, "result.json"));
     assert_eq!(place.run_in::<true>(THREES, false, &|_, _| done()).groups, [vec![2, 3, 5]]);

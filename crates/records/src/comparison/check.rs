@@ -32,7 +32,8 @@ pub(super) fn sets(sets: &[String]) -> Result<(), ValueError> {
     require(!sets.is_empty(), "a comparison", "without tests", "in tests that all conditions have")
 }
 
-/// Refuses policies that differ in environment, success rule, or the parameters of a test set.
+/// Refuses policies that lack a test on one of `sets`. Also refuses policies that differ in environment, success rule,
+/// or the parameters of a test set.
 pub(super) fn records(conditions: &[ComparedCondition<'_>], sets: &[String]) -> Result<(), ValueError> {
     self::sets(sets)?;
     // All policies must have the environment, the success rule and the sets of the first policy.

@@ -57,7 +57,7 @@ pub struct ConditionMean {
     /// The 95 % interval of the mean over episodes, [low, high]. It supports conclusions about the same policies in
     /// other episodes. For returns and lengths it is a t interval. For success rates it is Wilson's interval with an
     /// effective number of episodes, because policies that play the same episodes are not independent. `None` if
-    /// only the means of policies are known.
+    /// only the means of policies are known. For returns and lengths also `None` with fewer than three episodes.
     pub episodes_95: Option<[f64; 2]>,
 }
 
@@ -82,7 +82,7 @@ pub struct ConditionDifference {
     /// policies are not paired. `None` if either condition has fewer than three policies.
     pub seeds_95: Option<[f64; 2]>,
     /// The 95 % interval of the difference over episodes, [low, high]. `None` if only the means of policies are
-    /// known.
+    /// known. If `same_episodes` is true, also `None` with fewer than three episodes.
     pub episodes_95: Option<[f64; 2]>,
     /// Whether all policies of both conditions played the same episodes. If so, `episodes_95` is computed from the
     /// difference in each episode.
@@ -120,8 +120,8 @@ pub struct ConditionComparison {
 ///
 /// # Errors
 /// [`ValueError`] if a condition has no policies, two conditions have the same name, or the baseline is unknown. Also
-/// if a policy was not tested on a set of `sets`, or if environments, success rules or a set's parameters differ
-/// between policies.
+/// if `sets` is empty, a policy was not tested on a set of `sets`, or environments, success rules or a set's parameters
+/// differ between policies.
 pub fn compare(
     conditions: &[ComparedCondition<'_>],
     sets: &[String],

@@ -13,7 +13,8 @@ type EpisodeAddress = (u64, u32, u64);
 pub(super) struct TestScores {
     /// The address of each episode, in recorded order; empty if the addresses are not known.
     addresses: Vec<EpisodeAddress>,
-    /// The score of each episode, in recorded order; empty if only the mean score is known.
+    /// The score of each episode, in the order of `addresses` if these are known. Empty if only the mean score is
+    /// known.
     pub(super) values: Vec<f64>,
     /// The mean score.
     pub(super) mean: f64,

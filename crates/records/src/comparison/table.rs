@@ -31,7 +31,7 @@ struct RowTest<'a> {
 /// condition of this name. Otherwise compares every pair of conditions.
 ///
 /// If `sets` is `None`, compares on every test set that all policies were tested on. If the rows are from several
-/// studies, only versions count, because two studies may call different sets by the same name.
+/// studies, only tests on versions are compared, because two studies may call different sets by the same name.
 ///
 /// # Errors
 /// [`ValueError`] if a condition has no results, two conditions have the same name, or two policies of a condition have

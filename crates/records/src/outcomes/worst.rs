@@ -122,9 +122,9 @@ mod tests {
         assert!((rate - (10.0 + 20.0) / 2.0).abs() < 1e-9, "{rate}");
     }
 
-    /// All contexts are alike. If the same episodes ranked them, the worst tenth would look far worse. With 20 episodes
-    /// each, the rates are 0.5 ± 0.11, and the two lowest of 20 lie about 0.19 below 0.5. The mean of 40 repetitions
-    /// with 40 episodes has a standard error of 0.0125.
+    /// All contexts are alike. If the same episodes ranked the contexts and measured success, the worst tenth would
+    /// look far worse: with 20 episodes each, the rates are 0.5 ± 0.11, and the two lowest of 20 rates lie about 0.19
+    /// below 0.5. The mean of 40 repetitions with 40 episodes each has a standard error of 0.0125.
     #[test]
     fn bad_luck_is_not_taken_for_bad_contexts() {
         let mut rng = stream(1, Purpose::TestEnvironments);

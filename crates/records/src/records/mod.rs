@@ -1,7 +1,7 @@
 //! Recorded test episodes, with the requested parameters, the applied parameters and the outcome of each.
 //!
-//! The tests of one policy are in one Parquet file. Every figure of a test result can be computed from it, for any
-//! success threshold. Each episode can be replayed from its seed, environment index and episode index.
+//! The tests of one policy are in one Parquet file. Every figure of a test result can be computed from this file, for
+//! any success threshold. Each episode can be replayed from its seed, environment index and episode index.
 
 mod checksum;
 mod columns;
@@ -51,8 +51,9 @@ pub struct RecordsMetadata {
     pub episodes_per_trial: u32,
     /// The success criterion; `None` if the server determined success without stating its criterion.
     pub success: Option<Criterion>,
-    /// The success criterion in the paper of Packer et al. (2018). `None` in records of older programs, which had only
-    /// one criterion.
+    /// The environment's own success criterion. In the paper's environments, this is the one in the paper of Packer et
+    /// al. (2018). `None` if `code_success` is `None`; this includes records of older programs, which had only one
+    /// criterion.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub text_success: Option<Criterion>,
     /// The success criterion in the published code of Packer et al. (2018). `None` if the server did not report it.

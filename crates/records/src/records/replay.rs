@@ -3,7 +3,8 @@
 use super::EpisodeRecord;
 
 impl EpisodeRecord {
-    /// Describes the first difference of the replayed episode `got` from this record. Returns `None` if there is none.
+    /// Describes the first difference of the replayed episode `got` from this record. Does not compare the seeds or the
+    /// successes. Returns `None` if everything else is equal.
     pub fn difference(&self, got: &Self) -> Option<String> {
         let both = |field: fn(&Self) -> String| (field(self), field(got));
         let parts = [

@@ -179,8 +179,8 @@ fn a_value_that_the_physics_did_not_take_is_named() {
     records.episodes[3].applied[1] = 0.2;
     records.about.parameters[1].applied = String::new();
     let agreement = records.agreement();
-    assert_eq!(agreement.episodes, 0, "a server that does not say it of every parameter");
-    assert!(agreement.largest.unwrap().exceeds_tolerance(), "what can be compared still is");
+    assert_eq!(agreement.episodes, 0, "the server did not name the applied quantity of every parameter");
+    assert!(agreement.largest.unwrap().exceeds_tolerance(), "the other parameter is still compared");
     records.episodes[3].requested.clear();
     assert!(records.agreement().largest.unwrap().exceeds_tolerance(), "a receipt that lacks values");
 }

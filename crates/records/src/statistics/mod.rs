@@ -22,9 +22,9 @@ pub use t_interval::{mean_with_t_interval, t_test_p};
 pub struct Summary {
     /// Arithmetic mean.
     pub mean: f64,
-    /// Population standard deviation (divided by n, not n - 1), as in the paper's tables. The paper does not say which,
-    /// but it gives 0.06 ± 0.12 % for five runs of 1000 episodes. Their rates must be 0.3, 0, 0, 0 and 0 %, and
-    /// division by n - 1 would give 0.13 %. `None` for a single run, or if unknown.
+    /// Population standard deviation (divided by n, not n - 1), as in the paper's tables. The paper does not state the
+    /// divisor, but it gives 0.06 ± 0.12 % for five runs of 1000 episodes. The rates of these runs must be 0.3, 0, 0, 0
+    /// and 0 %, and division by n - 1 would give 0.13 %. `None` for a single run, or if unknown.
     pub std: Option<f64>,
     /// The number of runs.
     pub runs: usize,

@@ -21,17 +21,22 @@ pub fn sign_flip_p(differences: &[f64], seed: u64) -> f64 {
     let seen: f64 = differences.iter().sum::<f64>().abs();
     // Tolerance for comparing sums, because sums that are equal in theory may differ by rounding errors.
     let rounding = 1e-9 * differences.iter().map(|difference| difference.abs()).sum::<f64>();
-    let is_as_far = |signs: u64| {
-        let sign = |place: usize| if signs >> (place % 64) & 1 == 1 { 1.0 } else { -1.0 };
-        let sum: f64 = differences.iter().enumerate().map(|(place, difference)| sign(place) * difference).sum();
+    // `next_signs` returns the signs of the next 64 differences, one in each bit.
+    let is_as_far = |next_signs: &mut dyn FnMut() -> u64| {
+        let signed = |differences: &[f64]| -> f64 {
+            let signs = next_signs();
+            let sign = |place: usize| if signs >> place & 1 == 1 { 1.0 } else { -1.0 };
+            differences.iter().enumerate().map(|(place, difference)| sign(place) * difference).sum()
+        };
+        let sum: f64 = differences.chunks(64).map(signed).sum();
         sum.abs() >= seen - rounding
     };
     if differences.len() <= MAX_EXACT_PAIRS {
         let all = 1_u64 << differences.len();
-        return (0..all).filter(|&signs| is_as_far(signs)).count() as f64 / all as f64;
+        return (0..all).filter(|&signs| is_as_far(&mut || signs)).count() as f64 / all as f64;
     }
     let mut rng = stream(seed, Purpose::Bootstrap);
-    let as_far = (0..N_SIGN_SAMPLES).filter(|_| is_as_far(rng.next_u64())).count();
+    let as_far = (0..N_SIGN_SAMPLES).filter(|_| is_as_far(&mut || rng.next_u64())).count();
     (1 + as_far) as f64 / f64::from(1 + N_SIGN_SAMPLES)
 }
 
@@ -64,10 +69,20 @@ mod tests {
         assert_eq!(sign_flip_p(&[1.0; 16], 1), 2_f64.powi(-15));
     }
 
+    #[test]
+    fn pairs_64_apart_have_independent_signs() {
+        let signed = |positive: usize, size: f64| (0..64).map(move |i| if i < positive { size } else { -size });
+        let differences: Vec<f64> = signed(36, 1.0).chain(signed(40, 0.5)).collect();
+        // The sum is 16, and its standard deviation with random signs is √(64 + 64 / 4) = 8.94: p is near 0.074. If
+        // pairs 64 apart had the same sign, the standard deviation would be 11.7, and p near 0.17.
+        let p = sign_flip_p(&differences, 1);
+        assert!((0.06..0.09).contains(&p), "{p}");
+    }
+
     /// With 17 pairs there are 131 072 combinations of signs. The p-value is estimated from the observed combination
     /// and 100 000 random ones. The estimate's standard deviation is √(p (1 - p) / 100 000), at most 0.0016.
     #[test]
-    fn of_many_pairs_random_signs_come_to_the_same() {
+    fn p_of_many_pairs_is_estimated_from_random_signs() {
         let differences: Vec<f64> = (0..17).map(|i| f64::from(i % 5) - 1.2).collect();
         let with_one_more = |sign: f64| sign_flip_p(&[&differences[..16], &[sign * differences[16]]].concat(), 1);
         // The absolute sum of the differences if difference i has the sign in bit i of `signs`.

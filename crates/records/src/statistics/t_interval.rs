@@ -90,8 +90,8 @@ mod tests {
         assert_eq!(ends(&[vec![100.0; 3]]), [100.0, 100.0]);
     }
 
-    /// The expected values are the areas under the tails of the t distribution: 1 - t / √(2 + t²) with 2 degrees of
-    /// freedom, and computed by Simpson's rule with Welch's 4.03 degrees.
+    /// The expected values are the areas under the tails of the t distribution. With 2 degrees of freedom, the area is
+    /// 1 - t / √(2 + t²). With Welch's 4.03 degrees, the area was computed by Simpson's rule.
     #[test]
     fn p_values_are_those_of_the_textbook_tests() {
         let close = |got: Option<f64>, expected: f64| assert!((got.unwrap() - expected).abs() < 1e-5, "{got:?}");

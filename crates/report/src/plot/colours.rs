@@ -83,7 +83,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn lightness_alone_says_how_much() {
+    fn luminance_is_monotonic_in_the_share() {
         let shares: Vec<f64> = (0..=100).map(|i| f64::from(i) / 100.0).collect();
         let rising = |colours: Vec<f64>| colours.windows(2).all(|pair| pair[0] < pair[1]);
         assert!(rising(

@@ -162,7 +162,7 @@ impl HeatmapPanels {
         (width.min(MAX_PANEL_WIDTH), width.clamp(HEIGHTS.start, HEIGHTS.end))
     }
 
-    /// Returns the frame of the panel in this column of a row, whose upper edge is at `top`.
+    /// Returns the frame of the panel in this column of a row. The upper edge of the frame is at `top`.
     fn frame(&self, column: usize, top: f64) -> Frame {
         let [x, y] = &self.axes;
         let (width, height) = self.size();

@@ -31,8 +31,8 @@ pub struct IntervalPlot {
     pub(crate) x_name: String,
     pub(crate) x: Range<f64>,
     pub(crate) groups: Vec<Group>,
-    /// The texts of the legend. They explain a row's number, its interval and its second number (see
-    /// [`IntervalRow::other`]). A text may be empty if no row has this symbol.
+    /// The texts of the legend. They explain the symbols for a row's number, its interval and its second number (see
+    /// [`IntervalRow::other`]). A text may be empty if its symbol occurs in no row.
     pub(crate) legend: [String; 3],
     /// The note below all groups.
     pub(crate) note: String,
@@ -144,7 +144,8 @@ impl IntervalPlot {
         }
         match row.point {
             Some(point) => canvas.circle((frame.x(point), y - apart), RADIUS, style.colour.filled())?,
-            // If the second number is in the left half, writes the text at the right end, so that they do not overlap.
+            // If the second number is in the left half, writes "missing" at the right end, so that it does not cover
+            // the number.
             None if row.other.is_some_and(|other| frame.x(other) < frame.middle().0) => {
                 canvas.text("missing", (frame.right() - 6.0, y), TextAnchor::Right)?;
             }

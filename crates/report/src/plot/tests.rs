@@ -114,7 +114,8 @@ fn texts_have_nine_points_and_stay_inside() {
     }
 }
 
-/// The SVG writes the colours that `style.css` replaces on a dark page in the form that its selectors expect.
+/// On a dark page, `style.css` replaces some colours of a picture. The SVG writes these colours in the form that the
+/// selectors in `style.css` expect.
 #[rstest]
 #[case("[fill=\"#FFFFFF\"]", "fill=\"#FFFFFF\"")]
 #[case("[fill=\"#222222\"]", "fill=\"#222222\"")]

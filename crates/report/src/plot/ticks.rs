@@ -44,8 +44,9 @@ pub(super) fn rounded(range: &Range<f64>) -> Range<f64> {
     }
 }
 
-/// Formats a tick. All ticks of the axis are multiples of 10^`power`, which decides on the number of decimals.
-/// `largest` is the largest tick. This tick decides whether all ticks are written in thousands (k) or millions (M).
+/// Formats a tick. All ticks of the axis are multiples of 10^`power`, and `power` decides the number of decimals.
+/// `largest` is the largest absolute value of the ticks. It decides whether all ticks are written in thousands (k) or
+/// millions (M).
 fn format_tick(value: f64, power: i32, largest: f64) -> String {
     // Adding 0 makes a negative zero positive.
     if power < 0 {

@@ -171,13 +171,13 @@ mod tests {
         let plan = "environments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff', 'rc']";
         let methods = perturb_experiment::Plan::parse("test", plan.into()).unwrap().methods();
         let compared = |scores: &[Vec<f64>]| compare(ALL, [&methods[0], &methods[1]], Metric::Default, scores);
-        // In both environments, x is better by 1 in each run, although scores differ much between runs.
+        // In both environments, x is better by 1 in each run, although the scores differ widely between runs.
         let [x, y] = [0.0, 1.0].map(|less| [10.0, 50.0, 90.0].map(|score| score - less).to_vec());
         let comparison = compared(&[x.clone(), x.clone(), y.clone(), y]).unwrap();
         assert_eq!((comparison.difference.point, comparison.difference.interval_95), (1.0, Some([1.0, 1.0])));
         assert_eq!((comparison.pairs, comparison.p), (6, 2_f64.powi(-5)));
-        // Each of x's three runs is compared with each of y's three runs. The runs of x are better in 3, 2 and 1 of
-        // them.
+        // Each of x's three runs is compared with each of y's three runs. The runs of x with scores 10, 50 and 90 beat
+        // one, two and three runs of y: 6 of 9 in total.
         assert!((comparison.improvement.point - 6.0 / 9.0).abs() < 1e-12);
         assert_eq!(compared(&[vec![1.0], vec![2.0]]), None, "one run says nothing of others");
     }

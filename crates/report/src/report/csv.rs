@@ -13,8 +13,7 @@ use super::numbers::{MethodMetrics, counted, or_empty};
 type BootstrappedOf = fn(&MethodMetrics<'_>, Metric) -> Option<Bootstrapped>;
 
 impl Report<'_> {
-    /// Returns the CSV files of the report, in addition to its documents and pictures. The title of each table is its
-    /// file name.
+    /// Returns the CSV files of the report, except those of its pictures. The title of each table is its file name.
     pub fn files(&self) -> Vec<Table> {
         let rows: Vec<_> = self.metrics.iter().chain(&self.averages).collect();
         let more = [self.comparisons_file(), self.parameters_file()].into_iter().filter(|file| !file.rows.is_empty());

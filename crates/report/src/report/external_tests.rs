@@ -62,7 +62,7 @@ fn agent_of_unknown_training_has_no_scenario() {
 }
 
 #[test]
-fn what_only_a_later_run_was_trained_on_has_its_rows() {
+fn training_distribution_of_only_a_later_run_has_its_row() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let agents = [&[Some(Version::D)][..], &[Some(Version::D), None]]
         .map(|trained_on| fixture::assessed("PPO", "Pendulum", trained_on, [200, 190, 100]));

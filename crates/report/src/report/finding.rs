@@ -122,9 +122,9 @@ impl<'a> Report<'a> {
 }
 
 /// Returns sentences that name the method with the best Extrapolation and the next one, and compare Extrapolation with
-/// Default. Returns `None` if no method has Extrapolation. If the rounded numbers of several methods are equal,
-/// they share the first place and none is called best. If a method has a single run, no method is called best either,
-/// and the method's numbers are marked. The random policy is left out, because it has learned nothing.
+/// Default. Returns `None` if no method has Extrapolation. If several methods have the highest rounded number, they
+/// share the first place and none is called best. If a method has a single run, no method is called best either, and
+/// the method's numbers are marked. The random policy is left out, because it has learned nothing.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     // Ranks the methods by Extrapolation.
     let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
@@ -141,7 +141,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     }
     let written = |mean: &Bootstrapped| format!("{:.1}", mean.point);
     let number = written(&extrapolation);
-    // `first` are the best methods: several if their rounded numbers are equal.
+    // `first` are the methods with the highest rounded number.
     let (first, others) = ranked.split_at(ranked.partition_point(|(.., mean)| written(mean) == number));
     let some_of_one_run = ranked.iter().any(|(.., mean)| mean.runs == 1);
     let claimed = if some_of_one_run { "comes out first" } else { "generalises best" };
@@ -149,7 +149,7 @@ fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
         _ if number == "0.0" => "none extrapolates: each has Extrapolation of 0.0 %".to_owned(),
         [_] => format!("{} {claimed}, with {numbers}", best.method),
         _ => format!(
-            "none {claimed}: {} come to the same Extrapolation, {}",
+            "none {claimed}: {} have the same Extrapolation, {}",
             listed(&first.iter().map(|(row, ..)| row.method.to_string()).collect::<Vec<_>>()),
             listed(&distinct(first.iter().map(|(.., mean)| format_mean(*mean)))),
         ),

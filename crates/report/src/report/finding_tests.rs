@@ -144,14 +144,14 @@ fn said_of_runs(rows: &[(&str, f64, f64, Option<[f64; 2]>)], runs: &[usize], mis
      (paper), with Extrapolation of 5.0 % [3.0, 6.0], and their intervals are apart. Extrapolation minus Default \
      ranges from -4.0 to -1.0 points."))]
 #[case::alike_and_random(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 8.0, Some([6.5, 9.0])), ("random", 1.0, 99.0, None)], 0,
-    Some("of 2 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 % [6.0, 9.0] \
+    Some("of 2 methods none generalises best: ppo ff (paper) and a2c ff (paper) have the same Extrapolation, 8.0 % [6.0, 9.0] \
      and 8.0 % [6.5, 9.0]. Extrapolation minus Default ranges from -1.0 to +0.0 points."))]
 #[case::overlapping(&[("ppo", 9.0, 8.0, Some([6.0, 9.0])), ("a2c", 8.0, 7.9, Some([6.5, 9.0]))], 0,
     Some("of 2 methods ppo ff (paper) generalises best, with Extrapolation of 8.0 % [6.0, 9.0] and Default of 9.0 %; next is a2c ff \
      (paper), with Extrapolation of 7.9 % [6.5, 9.0], and their intervals overlap. Extrapolation minus Default \
      ranges from -1.0 to -0.1 points."))]
 #[case::written_alike_before_another(&[("ppo", 9.0, 8.04, None), ("a2c", 8.0, 7.96, None), ("late", 9.0, 1.0, None)], 0,
-    Some("of 3 methods none generalises best: ppo ff (paper) and a2c ff (paper) come to the same Extrapolation, 8.0 %; next is late \
+    Some("of 3 methods none generalises best: ppo ff (paper) and a2c ff (paper) have the same Extrapolation, 8.0 %; next is late \
      ff (paper), with Extrapolation of 1.0 %. Extrapolation minus Default ranges from -8.0 to +0.0 points."))]
 #[case::none_extrapolates(&[("ppo", 95.3, 0.0, None), ("a2c", 0.0, 0.04, None)], 1,
     Some("of 2 of 3 methods none extrapolates: each has Extrapolation of 0.0 %. Extrapolation minus \
@@ -177,9 +177,9 @@ fn the_finding_in_words(
     Extrapolation of 8.0 % and Default of 9.0 %; next is a2c ff (paper), with Extrapolation of 5.0 %. Extrapolation \
     minus Default ranges from -4.0 to -1.0 points.")]
 #[case::alike(&[("ppo", 9.0, 8.0), ("a2c", 9.0, 8.0)], &[3, 1], "of 2 methods none comes out first: ppo ff (paper) and a2c ff \
-    (paper) come to the same Extrapolation, 8.0 % and 8.0 % (1 run). Extrapolation minus Default is -1.0 points for \
+    (paper) have the same Extrapolation, 8.0 % and 8.0 % (1 run). Extrapolation minus Default is -1.0 points for \
     each.")]
-fn of_one_run_nothing_is_claimed(#[case] rows: &[(&str, f64, f64)], #[case] runs: &[usize], #[case] said: &str) {
+fn with_a_single_run_none_is_best(#[case] rows: &[(&str, f64, f64)], #[case] runs: &[usize], #[case] said: &str) {
     let rows: Vec<_> =
         rows.iter().map(|&(name, default, extrapolation)| (name, default, extrapolation, None)).collect();
     assert_eq!(said_of_runs(&rows, runs, 0).as_deref(), Some(said));

@@ -1,5 +1,5 @@
 //! Pictures of the heatmaps of an experiment and of agents that were trained outside of the experiment: one for each
-//! environment, pair of parameters and method.
+//! environment, [kind of heatmap](HeatmapKind) and method.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::ops::Range;
@@ -19,8 +19,8 @@ use super::pictures::{Picture, PictureDrawing, file_name};
 use crate::heatmap_policies::points_table;
 use crate::plot::{HeatmapColumn, HeatmapPanels, PlotError, common_returns};
 
-/// The pictures of all heatmaps of a report. There is a picture for each environment, pair of parameters and method.
-/// A picture has a column for each training distribution, which shows the mean over runs.
+/// The pictures of all heatmaps of a report. There is a picture for each environment, [kind of heatmap](HeatmapKind)
+/// and method. A picture has a column for each training distribution, which shows the mean over runs.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct HeatmapPictures {
     /// The pictures that have at least one heatmap.
@@ -84,7 +84,7 @@ pub fn heatmap_pictures(
         let places: Vec<_> = places.iter().filter(|place| place.environment == environment).collect();
         let elsewhere: Vec<_> = rows.iter().map(|row| (&row.method, shown_elsewhere(row))).collect();
         let kinds_elsewhere = elsewhere.iter().flat_map(|(_, shown)| shown.iter().map(|(kind, _)| kind));
-        // The pairs of parameters that any heatmap in this environment has.
+        // Collects the kinds of all heatmaps in this environment.
         let kinds: BTreeSet<&HeatmapKind> =
             of_cells.get(environment).into_iter().flatten().chain(kinds_elsewhere).collect();
         let mut kinds: Vec<Option<&HeatmapKind>> = kinds.into_iter().map(Some).collect();

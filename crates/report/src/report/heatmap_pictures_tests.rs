@@ -153,7 +153,7 @@ fn mean_needs_equal_points_and_episodes() {
 }
 
 #[test]
-fn of_an_experiment_without_heatmaps_it_is_said_why() {
+fn experiment_without_heatmaps_has_advice_on_why() {
     let plan = Plan::parse("test", PLAN.into()).unwrap();
     let directory = tempfile::tempdir().unwrap();
     let folder = ExperimentFolder::new(directory.path());

@@ -22,7 +22,7 @@ architectures = ['ff']
 name = 'ppo'
 architectures = ['ff']
 ";
-/// Number of episodes in each test: forty in each of ten bins of the parameter's range.
+/// Number of episodes in each test. The test on R has ten bins with 40 episodes each.
 const EPISODES: u32 = 400;
 
 /// Returns the pole length of an episode. Lengths on R are 0.25 … 0.75. Lengths on E are below and above this range.

@@ -188,7 +188,7 @@ impl StudySource {
 
     /// Reads the recorded episodes of selected cells, if they exist, into `recorded`. For a study without a folder,
     /// also adds the comparisons of requested and applied parameters in all its episodes to `checks`. For a folder,
-    /// `exported` has already added them.
+    /// `exported` has already added these comparisons.
     fn add_episodes(
         &self,
         folder: Option<&ExperimentFolder>,

@@ -131,7 +131,7 @@ impl Report<'_> {
         pictures
     }
 
-    /// Returns the picture of an environment and a training distribution. `rows` are all its points.
+    /// Returns the picture of an environment and a training distribution. `rows` are all points of the picture.
     fn parameter_picture(&self, environment: &str, trained_on: TrainedOn<'_>, rows: &[&SweepPoint<'_>]) -> Picture {
         let trained = match trained_on {
             TrainedOn::Unknown => "with an unknown training distribution".to_owned(),

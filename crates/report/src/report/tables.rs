@@ -51,8 +51,8 @@ impl Report<'_> {
             .build()
     }
 
-    /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if no
-    /// method has any.
+    /// Returns the table of interquartile means and optimality gaps with their intervals; `None` if no method has such
+    /// numbers.
     pub(super) fn iqm_table(&self) -> Option<Table> {
         let title = "Interquartile means and optimality gaps: over all environments and the runs that all of them have, with \
                      95 % stratified bootstrap intervals. If configurations were selected, a second interval repeats the \

@@ -203,8 +203,9 @@ fn what_is_not_done_is_missing_and_has_no_colour() {
     let entries: Vec<_> =
         with_no_result(&plan, |report| report.tables().flat_map(|table| table.rows.into_iter().flatten()).collect());
     assert!(entries.iter().all(|entry| entry.heat.is_none()));
-    // The summands are: three tables of metrics; scenarios of two environments with three and two training
-    // distributions. There is no table of interquartile means, because all of it would be missing.
+    // The first summand is for three tables of metrics, each with two methods and three metrics. The second is for the
+    // tables of scenarios: three tests of each training distribution (three of A2C and two of RL²-PPO) in two
+    // environments. There is no table of interquartile means, because all of it would be missing.
     let expected = 3 * 2 * 3 + 3 * (3 + 2) * 2;
     assert_eq!(entries.iter().filter(|entry| entry.text == MISSING).count(), expected);
 }
@@ -262,7 +263,7 @@ fn files_tell_two_presets_of_a_method_apart() {
         for file in Report::new(&results, &selections, &recorded, &[]).files() {
             // In a comparison of two methods, only one has a non-default preset, so only one has the column.
             let columns = file.columns.iter().filter(|column| column.name.ends_with(name)).count();
-            // Reference methods are not compared in pairs.
+            // A method that sees the parameters is a reference method, and reference methods are not compared in pairs.
             let compared = file.columns.iter().any(|column| column.name.starts_with("x_"));
             assert_eq!(columns, usize::from(expected && !(name == "observe" && compared)), "{}", file.title);
         }

@@ -83,12 +83,13 @@ impl PythonSession {
             SessionState::Idle(open) => {
                 let under_way = open.under_way;
                 *state = SessionState::Idle(open);
-                Err(failure(UNUSABLE, 0, format!("steps are under way, {under_way} of them: recv() first")))
+                let steps = if under_way == 1 { "step is" } else { "steps are" };
+                Err(failure(UNUSABLE, 0, format!("{under_way} {steps} under way: call recv() first")))
             }
             SessionState::Busy => Err(failure(
                 UNUSABLE,
                 0,
-                "another thread waits for a reply: an environment is for one thread at a time",
+                "another thread waits for a reply: only one thread at a time may use an environment",
             )),
             before => {
                 *state = before;

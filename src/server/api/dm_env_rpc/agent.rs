@@ -33,8 +33,8 @@ const WORLD_PRICE: u64 = 17;
 /// The price of `reset` and `reset_world`, in steps: the same as of a `reset` of one environment in `perturb.v1` that
 /// begins a new trial.
 const NEW_TRIAL_PRICE: u64 = 3;
-/// The maximum length of a request, bytes. Valid requests are far shorter, because a world has one environment. The
-/// limit is high so that a longer, invalid request still gets an error in-band.
+/// The maximum length of a request, bytes. Valid requests are far shorter, because a world has one environment. An
+/// invalid request up to this length gets an in-band error; a longer request ends the stream.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
 /// The state of a client's stream. When it is dropped, the agent leaves the joined world, and the worlds made by the
@@ -71,7 +71,8 @@ impl Agent {
         }
         settings::check_none("join_world", &request.settings)?;
         let (world, runner) = self.worlds.join(&self.caller, &request.world_name)?;
-        // Stored before the first `await`: if the client disconnects there, dropping the agent returns the world.
+        // The world is stored before the first `await`: if the client disconnects there, dropping the agent leaves the
+        // world.
         let joined = self.joined.insert(JoinedWorld { world, runner });
         self.stats = SessionStats { environment: Some(joined.world.spec().name), envs: 1, ..self.stats };
         joined.runner.finish_abandoned().await;

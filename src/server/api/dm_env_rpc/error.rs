@@ -18,7 +18,7 @@ pub enum Error {
     /// The session layer refused the request.
     #[error(transparent)]
     Session(#[from] session::Error),
-    /// The token's role does not allow the draw, or the ledger cannot be written.
+    /// The token's role does not allow the draw, or the ledger cannot record it.
     #[error(transparent)]
     Audit(#[from] audit::Error),
     /// An environment or a parameter is unknown or invalid.

@@ -1,5 +1,5 @@
-//! Checks the names and types of settings in requests, and converts them to the types of [`env`] and the pool, which
-//! check the values.
+//! Checks the settings in requests, and converts them to the types of [`env`] and the pool. The bounds of parameters
+//! are checked by [`resolve`].
 
 use super::{Error, tensors};
 use crate::{
@@ -106,8 +106,9 @@ fn ownership(settings: &WorldSettings) -> Result<Ownership, Error> {
 /// Checks the settings of `reset` or `reset_world`.
 ///
 /// # Errors
-/// If a setting is unknown, of a wrong type, or not finite. [`World::change`](super::world::World::change) checks the
-/// bounds of parameters later.
+/// If a setting is unknown, of a wrong type, or invalid, e.g. a negative seed or a parameter that is not finite. Also
+/// if a setting is a disturbance with which the world was not created. [`World::change`](super::world::World::change)
+/// checks the bounds of parameters later.
 pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,

@@ -1,4 +1,5 @@
-//! Checks the type, shape, number of elements and bounds of tensors. Does not convert between types.
+//! Checks the type, shape, number of elements and bounds of tensors. A tensor of an unexpected type is refused, not
+//! converted; only integer scalars may have any of four types.
 
 use super::Error;
 use crate::proto::dm_env_rpc::v1::{DataType, Tensor, tensor::Payload};
@@ -59,8 +60,8 @@ pub(super) fn integer(field: &str, tensor: &Tensor, low: u64, high: u64) -> Resu
     within.ok_or_else(|| Error::value(field.to_owned(), one, format!("an integer from {low} to {high}")))
 }
 
-/// Returns the elements of an INT32 tensor of this shape. A tensor with a single element stands for a tensor of equal
-/// elements. `bounds` has one range for each element.
+/// Returns the elements of an INT32 tensor of this shape. A single element is broadcast to the whole shape. `bounds`
+/// has one range for each element.
 ///
 /// # Errors
 /// If `tensor` has another type or shape, or an element is out of its bounds.
@@ -71,8 +72,8 @@ pub(super) fn int32s(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(i
     }
 }
 
-/// Returns the elements of a FLOAT tensor of this shape. A tensor with a single element stands for a tensor of equal
-/// elements. `bounds` has one range for each element.
+/// Returns the elements of a FLOAT tensor of this shape. A single element is broadcast to the whole shape. `bounds` has
+/// one range for each element.
 ///
 /// # Errors
 /// If `tensor` has another type or shape, or an element is out of its bounds.
@@ -84,8 +85,8 @@ pub(super) fn floats(field: &str, tensor: &Tensor, shape: &[usize], bounds: &[(f
 }
 
 /// Checks the shape and bounds of a tensor with the elements `given`, and returns one element for each of `bounds`. As
-/// in dm_env_rpc, a tensor with a single element stands for a tensor of equal elements, and a negative dimension is
-/// inferred from the number of elements. A tensor may not use both rules.
+/// in dm_env_rpc, a single element is broadcast to the whole shape, and a negative dimension is inferred from the
+/// number of elements. A tensor may not use both rules.
 fn elements<T: Copy + PartialOrd + Display>(
     field: &str,
     tensor: &Tensor,

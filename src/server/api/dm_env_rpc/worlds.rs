@@ -93,7 +93,7 @@ impl Worlds {
         &self.catalogue
     }
 
-    /// Registers a new stream.
+    /// Gives a new stream its number. Returns the stream with its token.
     pub(super) fn caller(&self, bearer: Option<Bearer>) -> Caller {
         let mut registry = self.lock();
         registry.streams += 1;

@@ -3,8 +3,8 @@
 
 use super::MAX_CELLS_PER_JOB;
 
-/// Intended duration of a job in seconds. Most jobs end earlier, because estimates assume that every episode lasts
-/// until the step limit.
+/// Intended duration of a job in seconds. Before similar cells have finished, most jobs end earlier, because estimates
+/// then assume that every episode lasts until the step limit.
 pub(super) const JOB_SECONDS: f64 = 300.0;
 
 /// Maximum size of a job.
@@ -112,6 +112,6 @@ mod tests {
         let groups = [all[..2].to_vec(), all[2..3].to_vec(), all[3..].to_vec()];
         assert_eq!(batches(&groups, JobSize::Cells(2), 1000), [vec![0, 1], vec![2], vec![3, 4], vec![5]]);
         assert_eq!(batches(&groups, JobSize::Seconds(9.0), 1000), [vec![0, 1], vec![2], vec![3, 4, 5]]);
-        assert_eq!(batches(&groups, JobSize::Seconds(9.0), 2).len(), 2, "it ends, though they cannot be put together");
+        assert_eq!(batches(&groups, JobSize::Seconds(9.0), 2).len(), 2, "it ends, although groups cannot share a job");
     }
 }

@@ -163,7 +163,7 @@ fn sbatch_arguments(submission: &Submission, options: &SlurmOptions) -> Result<V
         "--nodes=1".to_owned(),
         "--ntasks=1".to_owned(),
         format!("--cpus-per-task={}", options.task.cores()),
-        "--requeue".to_owned(), // Slurm itself queues the jobs of a lost node again, even if no `perturb run` is watching
+        "--requeue".to_owned(), // Slurm queues the jobs of a lost node again, even if no `perturb run` is watching
         format!("--chdir={path}"),
         format!("--output={}/%a.jsonl", path.replace('%', "%%")),
         format!("--error={}/%a.log", path.replace('%', "%%")),
@@ -188,8 +188,8 @@ impl QueueAnswer {
     fn parse(text: &str) -> Result<Self, SlurmError> {
         let mut answer = Self::default();
         for line in text.lines().map(str::trim).filter(|line| !line.is_empty()) {
-            // A banner may contain the separator, too. A line that begins with a digit counts as a job, so a failure to
-            // parse it is an error.
+            // A banner may contain the separator, too. A line counts as a job only if it has a separator and begins
+            // with a digit. A failure to parse such a line is an error.
             let first = line.split_once(SEPARATOR).map(|(first, _)| first.trim());
             if first.is_some_and(|first| first.starts_with(|c: char| c.is_ascii_digit())) {
                 answer.jobs.push(parse_job(line)?);
@@ -269,7 +269,7 @@ mod tests {
     }
 
     #[test]
-    fn sbatch_hears_everything_that_was_asked_for() {
+    fn sbatch_gets_all_requested_options() {
         let mut options = options();
         let names = SlurmNames { name: "perturb-x-1".into(), job: None };
         let jobs = vec![vec!["a".into()]; 3];

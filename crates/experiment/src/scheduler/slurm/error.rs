@@ -47,7 +47,7 @@ pub enum SlurmError {
     /// The cost of cells cannot be estimated.
     #[error("cannot estimate the durations of cells, from which jobs get their size: {0}; give --cells-per-job")]
     Cost(AnyError),
-    /// All jobs of the run were cancelled.
+    /// The jobs of all unfinished cells were cancelled.
     #[error(
         "Slurm job {} was cancelled; the same command submits the unfinished cells again: {}",
         arrays.join(", "),

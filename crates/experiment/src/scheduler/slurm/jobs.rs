@@ -131,7 +131,7 @@ impl<'a> Jobs<'a> {
         Ok(())
     }
 
-    /// Records, for each cell of a submission, the job that has the cell as the cell's last job.
+    /// Records each job of a submission as the last job of its cells.
     fn remember(&mut self, submission: usize) {
         for (index, cells) in self.submissions[submission].jobs.iter().enumerate() {
             let cells = cells.iter().filter_map(|id| self.places.get(&**id));
@@ -213,7 +213,7 @@ impl<'a> Jobs<'a> {
             self.taken.remove(&cell);
             let job = self.last.get(&cell).map(|&(submission, index)| (self.submissions[submission].number, index));
             let begun = job.and_then(|job| self.cursors.get(&job)).map(|cursor| &cursor.cells);
-            // The job had not started this cell, so its end does not count as a failed attempt.
+            // If the job had started only other cells, its end does not count as a failed attempt at this cell.
             let was_started = begun.is_none_or(|cells| cells.is_empty() || cells.contains(&cell));
             self.pending_events.push(match was_started {
                 true => BackendEvent::Event(cell, CellEvent::Killed { reason: self.describe_end(cell) }),
@@ -322,7 +322,9 @@ impl<'a> Jobs<'a> {
         Ok(Vec::new())
     }
 
-    /// Returns the maximum size of a job. An estimated duration is at most half of the time limit.
+    /// Returns the maximum size of a job. Without `cells_per_job`, a job should take [`JOB_SECONDS`], or half of its
+    /// time limit if that is less. The size sums the durations of cells, so it is multiplied by the number of groups
+    /// that run in parallel.
     fn size(&self) -> JobSize {
         let limit = self.options.time.as_ref().map_or(f64::INFINITY, |limit| limit.seconds() as f64 / 2.0);
         match self.options.cells_per_job {

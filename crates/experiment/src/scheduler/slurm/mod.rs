@@ -7,10 +7,11 @@
 //!
 //! ```text
 //! DIR/slurm/lock               locked by the process that decides what to submit
-//! DIR/slurm/N/plan.toml        the plan of the Nth submission
+//! DIR/slurm/N/plan.toml        the plan of submission N; its CSV files are in the same folder
 //! DIR/slurm/N/cells.txt        line K+1: the cells of job K of the array, separated by commas
 //! DIR/slurm/N/job.sh           the script that every job of the array runs
 //! DIR/slurm/N/submission.json  the array's name in Slurm's queue and, once accepted, its number
+//! DIR/slurm/N/K.jsonl          standard output of job K: its events, one per line
 //! DIR/slurm/N/K.log            standard error of job K
 //! ```
 

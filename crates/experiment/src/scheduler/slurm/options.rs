@@ -182,7 +182,7 @@ mod tests {
     }
 
     #[test]
-    fn paths_that_slurm_would_read_otherwise_are_refused() {
+    fn paths_that_slurm_could_misread_are_refused() {
         assert_eq!(text_of(Path::new("/shared/it's 100%")), Ok("/shared/it's 100%"));
         for (path, reason) in [("runs/quick", "begin with /"), ("/a\nb", "control character"), ("/a\\b", "backslash")] {
             let error = text_of(Path::new(path)).unwrap_err().to_string();

@@ -216,7 +216,7 @@ fn a_second_call_watches_and_submits_only_what_is_new() {
 }
 
 #[test]
-fn what_slurm_lost_is_submitted_again() {
+fn cells_of_lost_jobs_are_submitted_again() {
     let mut fake = Fake::new();
     (fake.options.cells_per_job, fake.plan) = (None, of_one_kind());
     let ids = fake.ids();
@@ -377,7 +377,7 @@ fn cancelled_job_is_resubmitted_by_the_next_call_only() {
 }
 
 #[test]
-fn a_submission_whose_number_nobody_heard_is_found_by_its_name() {
+fn a_submission_without_a_stored_number_is_found_by_its_name() {
     let fake = Fake::new();
     let script = |_: &Path| Ok(String::new());
     let lost = submission::create(&fake.folder, &fake.plan, singles(&fake.ids()), &script).unwrap();
@@ -442,7 +442,7 @@ fn two_processes_do_not_submit_the_same_cells() {
         }
     });
     assert_eq!(end.unwrap(), stopped(&[]));
-    assert!(fake.submissions().is_empty(), "the other one decides");
+    assert!(fake.submissions().is_empty(), "the other process decides");
 }
 
 #[test]
