@@ -1,7 +1,7 @@
 """Send a policy to the server, which plays it and returns a trajectory. Uses only gRPC and the protocol in proto/.
 
 A feed-forward policy of random weights plays 200 steps in each of 8 CartPoles, in one round trip. Then this script
-computes its values and log-probabilities again, with NumPy. docs/rollouts.md says what the arrays hold.
+computes the policy's values and log-probabilities again, with NumPy. docs/rollouts.md explains the arrays.
 Needs grpcio-tools. Start perturb-server, and then run: python act.py [--server unix:/path]
 """
 

@@ -36,7 +36,7 @@ class Agent(nn.Module):  # type: ignore[misc]
 
 
 def main() -> None:
-    """Train, and print the returns of finished episodes."""
+    """Train a policy, and print the mean return of the last 100 episodes after every fifth update."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--version", choices=["D", "R", "E"], default="D")
     parser.add_argument("--steps", type=int, default=100_000)

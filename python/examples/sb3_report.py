@@ -1,5 +1,6 @@
-"""Train stable-baselines3's PPO on D and R, test it on D, R and E, and report it beside the paper's and our agents.
+"""Train stable-baselines3's PPO on D and R, test it on D, R and E, and write a report.
 
+The report also shows the results of the paper's agents and of a study in this repository.
 Run: python sb3_report.py STEPS EPISODES FOLDER, e.g. 200000 1000 /tmp/sb3-report
 """
 

@@ -1,4 +1,4 @@
-"""Fixtures of all tests: servers, programs, and the protocol's messages."""
+"""Fixtures and helpers that tests share: servers, programs, and the protocol's messages."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 def messages() -> Any:
     """Compile the protocol's messages with gRPC's own tools, so that tests do not depend on perturb's own code."""
-    folder = str(ROOT / "proto/perturb")  # with the folder above it, the modules would clash with the package perturb
+    folder = str(ROOT / "proto/perturb")  # its parent folder would provide a second package named perturb
     if folder not in sys.path:
         sys.path.append(folder)
     return grpc.protos("v1/perturb.proto")

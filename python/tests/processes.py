@@ -55,7 +55,7 @@ def python(*arguments: str) -> subprocess.Popen[str]:
 
 
 def output_of(*arguments: str, seconds: float = 60) -> tuple[str, str]:
-    """Run another Python process. Return its standard output and standard error. Fail if it does not end in time."""
+    """Run another Python process. Return its output and errors. Raise TimeoutExpired if it does not end in time."""
     process = python(*arguments)
     try:
         return process.communicate(timeout=seconds)

@@ -1,4 +1,4 @@
-"""stable-baselines3 trains on the environments without wrappers.
+"""stable-baselines3 accepts the environments, and the example trainings give the expected results.
 
 `make python-acceptance` runs these tests; they take minutes and download gigabytes of PyTorch."""
 
@@ -53,7 +53,7 @@ def test_stable_baselines3s_ppo_learns_cart_pole(server: str) -> None:
     output = run("sb3_ppo.py", "--server", server)
     match = re.search(r"(\d+) steps, mean return of the last 100 episodes ([\d.]+)\n.*test episodes ([\d.]+)", output)
     assert match is not None, output
-    assert int(match[1]) <= 60_000 + 2048, output  # the last rollout, of 2048 steps, is finished
+    assert int(match[1]) <= 60_000 + 2048, output  # trainings end after a complete rollout of 2048 steps
     assert max(float(match[2]), float(match[3])) >= 195, output
 
 
@@ -64,7 +64,7 @@ def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
     assert returns[0] < 100, returns
 
 
-def test_report_has_agent_and_checkpoint_gives_same_bytes(server: str, tmp_path: Path) -> None:
+def test_report_shows_the_agent_and_its_checkpoint_gives_the_same_bytes(server: str, tmp_path: Path) -> None:
     from stable_baselines3 import PPO
 
     lines = [line for line in (EXAMPLES / "sb3_report.py").read_text().splitlines() if line]

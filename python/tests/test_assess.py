@@ -61,7 +61,7 @@ def test_saved_assessments_are_listed(server: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("cell", ["CartPole-ppo-ff-D-9bd6546b-s7", "Pendulum-ppo-ff-R-9bd6546b-s8"])
-def test_shipped_policies_have_their_shipped_records(cell: str, server: str) -> None:
+def test_shipped_policies_reproduce_the_published_episodes(cell: str, server: str) -> None:
     """The 3000 test episodes of a shipped policy have the checksums in the results table."""
     pytest.importorskip("pandas")
     policy = perturb.load_policy(POLICIES / f"{cell}.safetensors")
@@ -111,7 +111,7 @@ def test_python_and_the_program_give_the_same_records(checkpoint: Path, tmp_path
     ],
     ids=["rc", "rc-continuous-sees-parameters", "rl2", "random"],
 )
-def test_python_and_the_program_agree_on_policies_that_remember(
+def test_python_and_the_program_agree_on_recurrent_and_random_policies(
     environment: str, settings: list[str], tmp_path: Path, server: str
 ) -> None:
     out = tmp_path / "run"
@@ -147,7 +147,7 @@ def test_python_and_the_program_agree_on_custom_sets_and_rules(tmp_path: Path, s
 def upright(observations: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """Push in the direction in which the pole falls. This policy is good on D, and worse on E."""
     pushed: np.ndarray[Any, Any] = (observations[:, 2] + observations[:, 3] > 0).astype(np.int64)
-    observations[:] = np.nan  # the function may change its observations
+    observations[:] = np.nan  # a policy may overwrite its observations
     return pushed
 
 
@@ -172,7 +172,7 @@ def test_function_plays_same_episodes_as_checkpoint(server: str) -> None:
 
 
 def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> None:
-    """The function counts the steps of each episode, and its counts equal the recorded lengths."""
+    """The function counts the steps of each episode, and all recorded lengths are among its counts."""
     lengths: list[int] = []
 
     def counts(observations: Any, memory: Any, starts: Any) -> tuple[Any, Any]:
@@ -197,7 +197,7 @@ def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> Non
     same_episodes(assessment, again)
 
 
-def test_random_functions_are_seeded_and_state_is_restored(server: str) -> None:
+def test_random_functions_are_seeded_and_numpys_state_is_restored(server: str) -> None:
     def guesses(observations: Any) -> Any:
         return np.random.randint(2, size=len(observations))
 
@@ -212,7 +212,7 @@ def test_random_functions_are_seeded_and_state_is_restored(server: str) -> None:
     assert (one.columns()["length"] != other.columns()["length"]).any()
 
 
-def test_policies_of_each_version_give_the_nine_scenarios(server: str) -> None:
+def test_policies_trained_on_three_versions_give_nine_scenarios(server: str) -> None:
     trained = {
         "R": perturb.load_policy(POLICIES / "CartPole-ppo-ff-R-9bd6546b-s7.safetensors"),
         "D": perturb.load_policy(CART_POLE),
@@ -233,7 +233,7 @@ def test_policies_of_each_version_give_the_nine_scenarios(server: str) -> None:
     assert assessment._repr_html_().count("<tr>") == 10 + 2 + 14
 
 
-def test_one_policy_has_the_metrics_of_its_training(server: str) -> None:
+def test_one_policy_has_the_metrics_of_its_training_version(server: str) -> None:
     assessment = perturb.evaluate(perturb.load_policy(CART_POLE), "CartPole", episodes=50, server=server)
     default = assessment["DD"].success_percent
     assert assessment.metrics == {"Default": default, "Interpolation": None, "Extrapolation": None}
@@ -244,7 +244,7 @@ def test_one_policy_has_the_metrics_of_its_training(server: str) -> None:
     assert named.metrics["Interpolation"] == named["RR"].success_percent
 
 
-def test_figures_follow_from_the_episodes(server: str) -> None:
+def test_results_are_computed_from_the_recorded_episodes(server: str) -> None:
     assessment = perturb.evaluate(upright, "CartPole", versions=("E",), episodes=1000, server=server)
     result, columns = assessment["E"], assessment.columns()
     n, successes = result.episodes, int(columns["success"].sum())
@@ -284,7 +284,7 @@ def test_figures_follow_from_the_episodes(server: str) -> None:
         assessment["DE"]
 
 
-def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
+def test_a_loaded_assessment_equals_the_saved_one(tmp_path: Path, server: str) -> None:
     trained = {"D": perturb.load_policy(CART_POLE), "E": upright}
     assessment = perturb.evaluate(trained, "CartPole", episodes=20, server=server)
     assessment.save(tmp_path / "saved")
@@ -305,7 +305,7 @@ def test_what_is_saved_is_loaded(tmp_path: Path, server: str) -> None:
             one.save(tmp_path / "other", overwrite=overwrite)
 
 
-def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
+def test_folders_without_a_readable_assessment_are_refused(tmp_path: Path, server: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="holds no assessment"):
         perturb.Assessment.load(tmp_path)
     perturb.evaluate(upright, "CartPole", episodes=10, server=server).save(tmp_path)
@@ -326,7 +326,7 @@ def test_what_is_no_assessment_is_refused(tmp_path: Path, server: str) -> None:
             perturb.Assessment.load(tmp_path)
 
 
-def test_pandas_has_every_episode_where_it_is_installed(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_to_pandas_has_every_episode_and_needs_pandas(server: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assessment = perturb.evaluate(upright, "CartPole", episodes=10, server=server)
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pandas", None)
@@ -346,8 +346,8 @@ class NoPolicy:
     ("change", "error", "words"),
     [
         ({"policy": NoPolicy()}, perturb.PolicyError, "expected one of load_policy"),
-        ({"policy": lambda: 0}, perturb.PolicyError, "must be given nothing; expected actions = f"),
-        ({"policy": lambda _a, _b: 0}, perturb.PolicyError, "must be given _a, _b; expected actions = f"),
+        ({"policy": lambda: 0}, perturb.PolicyError, "requires no arguments; expected actions = f"),
+        ({"policy": lambda _a, _b: 0}, perturb.PolicyError, "requires the arguments _a, _b; expected actions = f"),
         ({"policy": lambda _a, _b, _c: 0}, perturb.PolicyError, "gave int; expected a pair"),
         ({"policy": lambda _: np.zeros(3, int)}, perturb.InvalidArgumentError, r"shape \(3,\); expected \(5,\)"),
         ({"policy": lambda _: np.zeros(5)}, perturb.InvalidArgumentError, "expected integers"),
@@ -356,7 +356,7 @@ class NoPolicy:
         ({"policy": {"x": upright}}, perturb.InvalidArgumentError, "'x' is none of"),
         ({"policy": {"D": upright}, "trained_on": "D"}, perturb.InvalidArgumentError, "leave trained_on= out"),
         ({"environment": "Cart"}, perturb.InvalidArgumentError, "'Cart' is none of"),
-        ({"versions": "DRE"}, perturb.InvalidArgumentError, "expected several"),
+        ({"versions": "DRE"}, perturb.InvalidArgumentError, "expected a list"),
         ({"versions": ["x"]}, perturb.InvalidArgumentError, "'x' is none of"),
         ({"versions": []}, perturb.InvalidArgumentError, "nothing to test on"),
         (
@@ -379,7 +379,7 @@ class NoPolicy:
         ({"observe": "all"}, perturb.InvalidArgumentError, "observe='all'"),
     ],
 )
-def test_what_cannot_be_tested_is_refused(
+def test_wrong_arguments_of_evaluate_are_refused(
     change: dict[str, Any], error: type[Exception], words: str, server: str
 ) -> None:
     settings = {"policy": upright, "environment": "CartPole", "episodes": 5, "server": server, **change}
@@ -403,7 +403,7 @@ def test_settings_that_contradict_a_loaded_policy_are_refused(change: dict[str, 
         perturb.evaluate(perturb.load_policy(CART_POLE), **settings)
 
 
-def test_parameters_can_be_observed(server: str) -> None:
+def test_a_function_can_observe_parameters(server: str) -> None:
     seen: list[tuple[int, ...]] = []
 
     def looks(observations: Any) -> Any:
@@ -414,11 +414,11 @@ def test_parameters_can_be_observed(server: str) -> None:
     assert set(seen) == {(3, 7)}
 
 
-def test_without_a_server_a_private_one_plays() -> None:
+def test_without_an_address_a_private_server_is_used() -> None:
     assert perturb.evaluate(upright, "CartPole", versions=("D",), episodes=2)["D"].episodes == 2
 
 
-def test_the_papers_numbers_are_there_for_all_environments() -> None:
+def test_the_papers_results_are_available_for_all_environments() -> None:
     for name in perturb.environments():
         methods = _native.published(name)
         assert len(methods) == 14

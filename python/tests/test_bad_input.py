@@ -1,4 +1,4 @@
-"""Bad input is refused and changes nothing. The message says what came and what was expected."""
+"""Invalid input is refused and changes nothing. Errors name the invalid value and the expected values."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NAN, INF = float("nan"), float("inf")
         ("Pendulum", ["up"], "numbers"),
     ],
 )
-def test_a_wrong_action_moves_nothing(name: str, action: Any, says: str, server: str) -> None:
+def test_an_invalid_action_changes_nothing(name: str, action: Any, says: str, server: str) -> None:
     env, twin = (gymnasium.make(identifier(name), server=server).unwrapped for _ in range(2))
     good = env.action_space.sample()
     env.reset(seed=1)
@@ -61,7 +61,7 @@ def test_a_wrong_action_moves_nothing(name: str, action: Any, says: str, server:
         (np.zeros(3), "integers"),
     ],
 )
-def test_wrong_actions_of_a_batch_move_nothing(actions: Any, says: str, server: str) -> None:
+def test_invalid_actions_of_a_batch_change_nothing(actions: Any, says: str, server: str) -> None:
     envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=3, server=server)
     envs.reset(seed=1)
     saved = envs.unwrapped.snapshot()  # type: ignore[attr-defined]
@@ -124,7 +124,7 @@ def test_wrong_settings_are_refused(settings: dict[str, Any], error: type[Except
         perturb.PerturbEnv(**{"environment": "CartPole", "server": server, **settings}).reset()
 
 
-def test_unknown_names_are_key_errors_with_a_plain_sentence(server: str) -> None:
+def test_unknown_names_raise_key_errors_with_unquoted_messages(server: str) -> None:
     env = perturb.PerturbEnv("CartPole", server=server)
     env.reset()
     with pytest.raises(KeyError) as caught:
@@ -227,7 +227,7 @@ def test_calls_out_of_order_are_refused(server: str) -> None:
         envs.reset(options={"reset_mask": np.array([True, False])})
 
 
-def test_a_full_server_says_so(start_server: Callable[..., Any]) -> None:
+def test_a_full_server_names_its_limit(start_server: Callable[..., Any]) -> None:
     address = start_server("--max-envs", "10", "--max-sessions", "1").address
     with pytest.raises(perturb.ServerFullError, match="10"):
         perturb.PerturbVectorEnv("CartPole", 11, server=address).reset()
@@ -237,7 +237,7 @@ def test_a_full_server_says_so(start_server: Callable[..., Any]) -> None:
         perturb.PerturbEnv("CartPole", server=address).reset()
 
 
-def test_a_message_too_large_says_what_to_do(start_server: Callable[..., Any]) -> None:
+def test_error_of_a_too_large_message_names_the_flag_of_the_limit(start_server: Callable[..., Any]) -> None:
     address = start_server("--max-message-bytes", "1024").address
     envs = perturb.PerturbVectorEnv("CartPole", 500, server=address)
     envs.reset()
@@ -249,11 +249,11 @@ ADDRESSES = json.loads((ROOT / "crates/protocol/tests/addresses.json").read_text
 
 
 @pytest.mark.parametrize(("text", "target"), ADDRESSES["understood"].items())
-def test_addresses_are_understood_as_in_rust(text: str, target: str) -> None:
+def test_addresses_are_parsed_as_in_rust(text: str, target: str) -> None:
     assert parse_address(text).target == target
 
 
-def test_relative_socket_becomes_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_relative_path_of_a_socket_becomes_absolute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     assert parse_address("unix:my.sock").target == f"unix:{tmp_path}/my.sock"
 
@@ -280,6 +280,6 @@ def test_addresses_are_refused_as_in_rust(text: str) -> None:
         ("[nonsense]:80", "not an IPv6"),
     ],
 )
-def test_a_wrong_address_says_what_is_wrong(text: str, says: str) -> None:
+def test_error_of_a_wrong_address_says_what_is_wrong(text: str, says: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match=says):
         parse_address(text)

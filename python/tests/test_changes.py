@@ -1,4 +1,7 @@
-"""The physics can change while a training runs, and assignments without an effect are refused."""
+"""`set_parameters` changes parameters while a training runs.
+
+Assignments to an environment that would have no effect, such as `env.length = 1.0`, are refused.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,7 @@ def batch(server: str, mode: AutoresetMode = AutoresetMode.SAME_STEP, **settings
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
-def test_parameters_act_at_the_next_episode_of_each_slot(mode: AutoresetMode, server: str) -> None:
+def test_parameters_apply_from_the_next_episode_of_each_slot(mode: AutoresetMode, server: str) -> None:
     envs, plain = batch(server, mode), batch(server, mode)
     (observations, _), (expected, _) = envs.reset(seed=1), plain.reset(seed=1)
     for _ in range(3):
@@ -38,7 +41,7 @@ def test_parameters_act_at_the_next_episode_of_each_slot(mode: AutoresetMode, se
         np.testing.assert_array_equal(terminated[untouched], expected_terminated[untouched])
         ended = terminated | truncated
         if mode is AutoresetMode.SAME_STEP and ended.any():
-            for slot in np.flatnonzero(ended & untouched).tolist():  # the episode that ended had the earlier parameters
+            for slot in np.flatnonzero(ended & untouched).tolist():  # the ended episode had the old parameters
                 assert infos["final_info"]["parameters"]["length"][slot] != 0.7
         begun = ended if mode is AutoresetMode.SAME_STEP else before
         for slot in np.flatnonzero(begun).tolist():
@@ -55,7 +58,7 @@ def test_parameters_act_at_the_next_episode_of_each_slot(mode: AutoresetMode, se
     plain.close()
 
 
-def test_parameters_act_at_a_reset(server: str) -> None:
+def test_parameters_apply_from_the_next_reset(server: str) -> None:
     envs = batch(server, AutoresetMode.DISABLED)
     envs.set_parameters({"length": 0.7})
     assert envs.reset(seed=1)[1]["parameters"]["length"].tolist() == [0.7] * 3
@@ -75,7 +78,7 @@ def test_parameters_act_at_a_reset(server: str) -> None:
     env.close()
 
 
-def test_parameters_wait_while_steps_are_under_way(server: str) -> None:
+def test_parameters_are_not_applied_while_steps_are_unreceived(server: str) -> None:
     envs = batch(server)
     envs.reset(seed=1)
     envs.set_parameters({"length": 0.7})
@@ -104,7 +107,7 @@ def test_parameters_wait_while_steps_are_under_way(server: str) -> None:
         ([0.5], perturb.InvalidArgumentError, "expected a dict"),
     ],
 )
-def test_wrong_changes_are_refused_at_once(parameters: Any, error: type[Exception], says: str, server: str) -> None:
+def test_wrong_parameters_are_refused_at_once(parameters: Any, error: type[Exception], says: str, server: str) -> None:
     for env in (perturb.PerturbEnv("CartPole", server=server), batch(server)):
         with pytest.raises(error, match=says):
             env.set_parameters(parameters)
@@ -140,7 +143,7 @@ def test_attributes_that_exist_can_be_assigned(server: str) -> None:
     assert env.count == 1
 
 
-def test_values_are_written_alike_everywhere(server: str) -> None:
+def test_parameter_values_have_the_same_forms_everywhere(server: str) -> None:
     """A number, an interval and several intervals can be written as Python values and as text."""
     pairs: list[tuple[Any, str]] = [
         (0.7, "0.7"),
@@ -158,7 +161,7 @@ def test_values_are_written_alike_everywhere(server: str) -> None:
             envs.close()
 
 
-def test_seeds_may_have_holes_as_in_gymnasiums_own(server: str) -> None:
+def test_seeds_may_contain_none_as_in_gymnasiums_batches(server: str) -> None:
     envs, single = batch(server), perturb.PerturbEnv("CartPole", version="R", environment_index=1, server=server)
     envs.reset(seed=1)
     single.reset(seed=2)
@@ -180,7 +183,7 @@ def test_seeds_may_have_holes_as_in_gymnasiums_own(server: str) -> None:
 
 
 @pytest.mark.socket
-def test_a_batch_beyond_the_servers_size_is_refused_at_once(server: str) -> None:
+def test_a_batch_above_the_servers_limit_is_refused_at_once(server: str) -> None:
     for num_envs in (10**7, 10**9, 2**32 - 1):
         with pytest.raises(perturb.PerturbError, match=r"environments|num_envs|batch") as caught:
             perturb.PerturbVectorEnv("CartPole", num_envs, server=server)

@@ -103,7 +103,7 @@ def test_all_conditions_play_the_same_episodes(comparison: perturb.Comparison) -
             assert played == first
 
 
-def test_tables_and_files_have_what_is_shown(comparison: perturb.Comparison, tmp_path: Path) -> None:
+def test_comparisons_are_shown_as_text_html_latex_and_csv(comparison: perturb.Comparison, tmp_path: Path) -> None:
     text = str(comparison)
     assert "careful − plain" in text
     assert f"{comparison.mean('careful', 'E').mean:.1f}" in text
@@ -126,7 +126,7 @@ def test_tables_and_files_have_what_is_shown(comparison: perturb.Comparison, tmp
         comparison.mean("plain", "D")
 
 
-def test_saved_assessments_are_compared_as_they_are(
+def test_saved_assessments_are_compared_without_another_test(
     comparison: perturb.Comparison, tmp_path: Path, server: str
 ) -> None:
     saved: dict[str, list[Any]] = {"plain": [], "careful": []}
@@ -143,10 +143,10 @@ def test_saved_assessments_are_compared_as_they_are(
     assert mixed.differences[0].same_episodes
     assert mixed.mean("plain", "E").by_seed == comparison.mean("plain", "E").by_seed[:1]
     output = run("compare", str(tmp_path / "plain"), str(tmp_path / "careful"))
-    assert comparison.verdict in output, "the program says the same"
+    assert comparison.verdict in output, "the program prints the same verdict"
 
 
-def test_rows_of_a_results_table_are_compared_by_their_counts() -> None:
+def test_rows_of_a_results_table_are_compared_by_their_numbers_of_successes() -> None:
     pd = pytest.importorskip("pandas")
     results = perturb.read_results(ROOT / "results/results.parquet")
     rows = results[(results.study == "classic-ff") & (results.environment == "CartPole") & (results.seed > 1)]
@@ -184,7 +184,7 @@ def test_rows_of_a_results_table_are_compared_by_their_counts() -> None:
         *("compare", str(ROOT / "results/results.parquet/classic-ff"), "--by", "algorithm", "--baseline", "a2c"),
         *("--where", "environment=cart-pole", "trained_on=R", "algorithm=a2c,ppo", "seed=2..6"),
     )
-    assert f"{compared.verdict}." in output, "the program says the same"
+    assert f"{compared.verdict}." in output, "the program prints the same verdict"
     by_return = perturb.compare({"all": rows[rows.algorithm == "ppo"]}, versions=["E"], score="return")
     assert by_return.means[0].mean == pytest.approx(
         final[(final.algorithm == "ppo") & (final.tested_on == "E")].mean_return.mean(), rel=1e-12
@@ -204,7 +204,7 @@ def test_rows_of_a_results_table_are_compared_by_their_counts() -> None:
         perturb.compare({"a": rows}, episodes=5)
 
 
-def test_few_and_unequal_seeds_are_compared_as_such(server: str) -> None:
+def test_few_or_unequal_seeds_limit_the_verdict(server: str) -> None:
     conditions: dict[str, Any] = {
         "one": noisy(0.5, 1),
         "two": [noisy(0.3, 2), noisy(0.2, 3)],
@@ -233,7 +233,7 @@ def test_few_and_unequal_seeds_are_compared_as_such(server: str) -> None:
     assert two.verdict.endswith("two seeds decide nothing")
 
 
-def test_checkpoints_are_paired_by_their_seeds(server: str) -> None:
+def test_checkpoints_are_named_by_their_seeds(server: str) -> None:
     other = perturb.load_policy(POLICIES / "CartPole-ppo-ff-R-9bd6546b-s7.safetensors")
     conditions: dict[str, Any] = {"D": str(CART_POLE), "R": [other]}
     comparison = perturb.compare(conditions, "CartPole", versions=("D",), episodes=20, server=server)
@@ -271,13 +271,13 @@ def test_pictures_have_one_scale_for_all_conditions(comparison: perturb.Comparis
         ({"a": upright, "b": upright}, {"baseline": "c"}, "one of a, b"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(conditions: Any, settings: dict[str, Any], words: str, server: str) -> None:
+def test_compare_refuses_wrong_arguments(conditions: Any, settings: dict[str, Any], words: str, server: str) -> None:
     arguments = {"environment": "CartPole", "versions": ("D",), "episodes": 2, "server": server, **settings}
     with pytest.raises(perturb.InvalidArgumentError, match=words):
         perturb.compare(conditions, **arguments)
 
 
-def test_several_policies_of_one_assessment_are_no_condition(server: str) -> None:
+def test_assessments_that_cannot_be_compared_are_refused(server: str) -> None:
     both = perturb.evaluate({"D": upright, "R": upright}, "CartPole", versions=("D",), episodes=2, server=server)
     with pytest.raises(perturb.InvalidArgumentError, match="2 policies, trained on D, R; expected one policy for each"):
         perturb.compare({"a": both})
@@ -327,7 +327,7 @@ def test_progress_is_shown_on_request(server: str, capfd: pytest.CaptureFixture[
     assert "CartPole, function upright: testing on D: 3 of 3 episodes" in capfd.readouterr().err
 
 
-def test_a_test_is_found_by_its_own_name(server: str) -> None:
+def test_a_result_is_found_by_the_name_of_its_set(server: str) -> None:
     corners = perturb.sets.grid("corners", {"length": [0.3, 0.9]})
     policies = {"D": upright}
     assessment = perturb.evaluate(policies, "CartPole", versions=["E", corners], episodes=8, server=server)
@@ -339,7 +339,7 @@ def test_a_test_is_found_by_its_own_name(server: str) -> None:
         both["E"]
 
 
-def test_without_pandas_it_is_named(comparison: perturb.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_names_missing_pandas(comparison: perturb.Comparison, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="pip install pandas"):
         comparison.to_pandas()

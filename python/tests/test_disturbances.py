@@ -22,14 +22,14 @@ def observations(steps: int, **settings: Any) -> NDArray[np.float32]:
     return np.stack(rows)
 
 
-def test_late_observations_are_those_of_a_delay(server: str) -> None:
+def test_sensor_delay_returns_the_observations_of_earlier_steps(server: str) -> None:
     exact = observations(20, server=server)
     late = observations(20, server=server, parameters={"sensor_delay": 3})
     np.testing.assert_array_equal(late[3:], exact[:-3])
     np.testing.assert_array_equal(late[:3], np.repeat(exact[:1], 3, axis=0))
 
 
-def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
+def test_sensor_delay_agrees_with_gymnasiums_wrapper(server: str) -> None:
     wrapped = DelayObservation(gym.make("perturb/Pendulum-v1", server=server, disable_env_checker=True), delay=4)
     first, _ = wrapped.reset(seed=5)
     rows = [first] + [wrapped.step(np.array([np.sin(step)], dtype=np.float32))[0] for step in range(30)]
@@ -40,7 +40,7 @@ def test_delays_agree_with_gymnasiums_wrapper(server: str) -> None:
 
 
 class StickyActionOfPerturb(StickyAction[np.ndarray, np.ndarray]):
-    """Gymnasium's wrapper, which draws the random numbers of perturb's `action_hold` (docs/disturbances.md)."""
+    """Gymnasium's `StickyAction`, but with perturb's random numbers for `action_hold` (docs/disturbances.md)."""
 
     def __init__(self, environment: gym.Env[np.ndarray, np.ndarray], probability: float, seed: int) -> None:
         super().__init__(environment, probability)
@@ -65,12 +65,12 @@ class ActionHoldGenerator:
         return float(np.random.Generator(np.random.Philox(key=self._key, counter=counter)).random())
 
     def integers(self, low: int, _high: int) -> int:
-        """Return the minimum number of repetitions."""
+        """Return `low`, the minimum number of repetitions, instead of a random number."""
         return low
 
 
 @pytest.mark.parametrize("identifier", ["perturb/Pendulum-v1", "perturb/Acrobot-v1"])
-def test_holds_agree_with_gymnasiums_sticky_actions(server: str, identifier: str) -> None:
+def test_action_hold_agrees_with_gymnasiums_sticky_actions(server: str, identifier: str) -> None:
     def play(environment: gym.Env[np.ndarray, Any]) -> list[NDArray[np.float32]]:
         rows = [environment.reset(seed=7)[0]]
         actions = np.random.default_rng(3)
@@ -86,7 +86,7 @@ def test_holds_agree_with_gymnasiums_sticky_actions(server: str, identifier: str
     np.testing.assert_array_equal(play(StickyActionOfPerturb(plain, 0.4, 7)), play(held))
 
 
-def test_noise_is_that_of_numpys_streams(server: str) -> None:
+def test_numpy_computes_the_same_sensor_noise(server: str) -> None:
     exact = observations(20, server=server)
     noisy = observations(20, server=server, parameters={"sensor_noise": 0.01})
     ends = np.array([[-1, -1, -8], [1, 1, 8]], dtype=np.float32)
@@ -105,7 +105,7 @@ def test_physics_change_within_an_episode(server: str) -> None:
     assert (after[11:] != before[11:]).any(axis=1).all()
 
 
-def test_infos_and_observations_have_disturbances(server: str) -> None:
+def test_infos_and_observations_contain_disturbances(server: str) -> None:
     contexts = [{"action_delay": 2}, {"length": 1.2}]
     environment = gym.make_vec(
         "perturb/Pendulum-v1", num_envs=2, server=server, contexts=contexts, observe="parameters"
@@ -118,7 +118,7 @@ def test_infos_and_observations_have_disturbances(server: str) -> None:
     environment.close()
 
 
-def test_late_disturbances_are_refused_with_a_remedy(server: str) -> None:
+def test_adding_disturbances_to_an_existing_environment_is_refused_with_a_remedy(server: str) -> None:
     environment: Any = gym.make("perturb/Pendulum-v1", server=server).unwrapped
     with pytest.raises(perturb.InvalidArgumentError, match="where it is made"):
         environment.set_parameters({"action_delay": 1})

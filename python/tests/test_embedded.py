@@ -27,7 +27,7 @@ STEPS = 60
 
 
 def same(a: Any, b: Any) -> bool:
-    """Whether two outcomes have the same types and the same bits."""
+    """Whether two results of a reset or step have the same types and the same bits."""
     return all(data_equivalence(one, other, exact=True) for one, other in zip(a, b, strict=True))
 
 
@@ -83,7 +83,7 @@ def physics_threads() -> int:
     return sum(name.read_text().startswith("physics-") for name in names)
 
 
-def test_threads_end_with_last_environment() -> None:
+def test_threads_of_an_embedded_server_end_with_its_last_environment() -> None:
     environments = [perturb.PerturbEnv("CartPole", server="embedded") for _ in range(2)]
     assert physics_threads() == 0, "nothing is started before a reset"
     for one in environments:
@@ -96,7 +96,7 @@ def test_threads_end_with_last_environment() -> None:
     assert (EmbeddedServer, None) not in local_server._shared
 
 
-# Number of environments whose step takes long enough to be interrupted.
+# A step of this many environments takes long enough to be interrupted.
 MANY = 4096
 
 
@@ -105,7 +105,7 @@ def many() -> tuple[perturb.PerturbVectorEnv, Any]:
     return envs, np.zeros((MANY, 6), np.float32)
 
 
-def test_interrupt_ends_a_session_and_a_reset_begins_anew() -> None:
+def test_interrupt_ends_a_session_and_a_reset_opens_another() -> None:
     envs, actions = many()
     expected = envs.reset(seed=2)[0].tobytes()
     with interrupting(envs):
@@ -117,7 +117,7 @@ def test_interrupt_ends_a_session_and_a_reset_begins_anew() -> None:
 
 
 def test_wait_ends_when_another_thread_closes_the_environment() -> None:
-    """The step releases Python's lock, so another thread can close the environment."""
+    """The step releases Python's global interpreter lock, so another thread can close the environment."""
     envs, actions = many()
     envs.reset(seed=2)
     caught: list[BaseException] = []
@@ -201,7 +201,7 @@ def rewards(seed: int) -> list[float]:
 
 
 @pytest.mark.parametrize("method", ["spawn", "fork", "forkserver"])
-def test_processes_have_servers_of_their_own(method: Any) -> None:
+def test_each_process_has_its_own_embedded_server(method: Any) -> None:
     with perturb.PerturbEnv("CartPole", server="embedded") as parent:
         parent.reset(seed=1)
         with multiprocessing.get_context(method).Pool(2) as pool:
@@ -237,11 +237,11 @@ print("all ended")
 """
 
 
-def test_a_fork_while_a_thread_loads_models_hangs_nowhere() -> None:
+def test_a_fork_while_a_thread_loads_models_does_not_hang() -> None:
     assert output_of("-c", FORKING) == ("all ended\n", "")
 
 
-def test_threads_step_batches_of_their_own() -> None:
+def test_threads_step_their_own_environments_independently() -> None:
     def play(seed: int, into: dict[int, bytes]) -> None:
         with perturb.PerturbEnv("CartPole", server="embedded", version="R") as env:
             env.reset(seed=seed)
@@ -259,12 +259,12 @@ def test_threads_step_batches_of_their_own() -> None:
     assert together == alone
 
 
-def test_embedded_needs_no_program(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_embedded_server_needs_no_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(local_server.VARIABLE, "/nowhere/perturb-server")
     assert len(rewards(1)) == 5
 
 
-def test_small_step_does_not_wait_for_a_worker() -> None:
+def test_small_step_is_computed_by_the_calling_thread() -> None:
     """The calling thread does all the work, so the other threads use no processor time."""
     with perturb.PerturbEnv("CartPole", server="embedded") as env:
         env.reset(seed=1)
@@ -277,6 +277,6 @@ def test_small_step_does_not_wait_for_a_worker() -> None:
         assert time.process_time() - time.thread_time() - before < 0.05
 
 
-def test_training_needs_a_program() -> None:
+def test_train_refuses_the_embedded_server() -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="leave server= out"):
         perturb.train("CartPole", server="embedded")

@@ -17,7 +17,7 @@ from perturb.catalogue import CATALOGUE, CATALOGUE_ENTRIES
 from .conftest import identifier
 
 
-def test_every_environment_says_what_can_be_changed() -> None:
+def test_every_environment_lists_its_parameters() -> None:
     environments = perturb.environments()
     assert list(environments) == list(CATALOGUE)
     for (name, environment), entry in zip(environments.items(), CATALOGUE_ENTRIES, strict=True):
@@ -37,14 +37,14 @@ def test_every_environment_says_what_can_be_changed() -> None:
         assert pickle.loads(pickle.dumps(environment)) == environment
 
 
-def test_the_papers_cart_pole_is_there() -> None:
+def test_the_lengths_of_cart_pole_are_those_of_the_paper() -> None:
     length = perturb.environments()["CartPole"].parameters["length"]
     assert (length.unit, length.default) == ("m", 0.5)
     assert length.random == ((0.25, 0.75),)
     assert length.extreme == ((0.05, 0.25), (0.75, 1.0))
 
 
-def test_what_r_and_e_draw_lies_in_their_sets(server: str) -> None:
+def test_r_and_e_draw_parameters_from_their_intervals(server: str) -> None:
     versions: tuple[perturb.Version, ...] = ("R", "E")
     for version in versions:
         envs = perturb.PerturbVectorEnv("CartPole", 200, version=version, server=server)
@@ -101,7 +101,7 @@ def test_a_copied_batch_plays_the_same_episodes_after_a_reset(server: str) -> No
 
 
 @pytest.mark.parametrize("version", ["x", "RE", "", None, 1, ["R"]])
-def test_versions_are_refused_alike_everywhere(version: Any) -> None:
+def test_wrong_versions_are_refused_with_the_same_words_everywhere(version: Any) -> None:
     words = "none of 'D'"
     with pytest.raises(perturb.InvalidArgumentError, match=words):
         perturb.PerturbEnv("CartPole", version=version)
@@ -115,19 +115,19 @@ def test_versions_are_refused_alike_everywhere(version: Any) -> None:
             perturb.evaluate(lambda observations: observations, "CartPole", trained_on=version)
 
 
-def test_versions_are_typed() -> None:
+def test_the_type_of_versions_lists_all_versions() -> None:
     assert get_args(perturb.Version) == ("D", "R", "E", "R+E")
 
 
 @pytest.mark.parametrize("name", ["CartPole", "cartpole", "cart-pole", "perturb/CartPole-v1", "Perturb/cart_pole"])
-def test_names_are_spelled_as_one_likes(name: str, server: str) -> None:
+def test_several_spellings_of_names_are_accepted(name: str, server: str) -> None:
     env = perturb.PerturbEnv(name, version="r", server=server)  # type: ignore[arg-type]
     _, infos = env.reset(seed=1)
     expected = perturb.PerturbEnv("CartPole", version="R", server=server).reset(seed=1)[1]
     assert infos["parameters"] == expected["parameters"]
 
 
-def test_errors_say_what_was_meant() -> None:
+def test_errors_about_wrong_names_suggest_the_right_one() -> None:
     with pytest.raises(perturb.InvalidArgumentError, match=r"did you mean 'CartPole'\?"):
         perturb.PerturbEnv("CartPol")
     with pytest.raises(perturb.InvalidArgumentError, match="another revision than this package's perturb/CartPole-v1"):

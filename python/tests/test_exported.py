@@ -34,7 +34,7 @@ def same_actions(outputs: NDArray[Any], actions: NDArray[Any]) -> None:
     """Check that the actions can be sampled from the logits or means with the same random number for all rows."""
     if actions.dtype == np.float32:
         noise = actions - outputs
-        assert np.ptp(noise, axis=0).max() < 2e-6, "float32 products in another order"
+        assert np.ptp(noise, axis=0).max() < 2e-6, "larger than the rounding of float32"
         return
     logits = outputs.astype(np.float64)
     probabilities = np.exp(logits - logits.max(axis=1, keepdims=True))
@@ -82,7 +82,7 @@ def recurrent(environment: str, folder: Path, server: str) -> perturb.Policy:
 
 
 @pytest.mark.parametrize("environment", ["CartPole", "Pendulum"])
-def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Path, server: str) -> None:
+def test_recurrent_exports_have_the_memory_of_the_policy(environment: str, tmp_path: Path, server: str) -> None:
     """The torch and ONNX models agree with each other and with the policy over a thousand steps.
 
     The policy samples its actions, but the exported network returns only logits or means. To compare them, two actors
@@ -119,7 +119,7 @@ def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Pa
         out, h, c = session.run(None, {"observations": rows[place : place + 1], "h": h, "c": c})
         of_onnx.append(out)
     network, second = np.concatenate(of_torch), np.concatenate(of_other)
-    assert np.abs(network - np.concatenate(of_onnx)).max() < 1e-5, "float32 over a hundred steps"
+    assert np.abs(network - np.concatenate(of_onnx)).max() < 1e-5, "larger than rounding to float32 in a hundred steps"
     acted, acted_second = np.concatenate(actions), np.concatenate(others)
     if acted.dtype == np.float32:
         assert np.abs((acted - network) - (acted_second - second)).max() < 1e-5
@@ -133,14 +133,14 @@ def test_recurrent_exports_remember_as_the_policy(environment: str, tmp_path: Pa
     assert (acted != acted_second).any()
 
 
-def test_a_torch_export_is_tested_as_a_module(server: str) -> None:
+def test_evaluate_accepts_an_exported_torch_module(server: str) -> None:
     pytest.importorskip("torch")
     module = perturb.load_policy(CART_POLE).to_torch()
     assessment = perturb.evaluate(module, "CartPole", versions=("D",), episodes=20, server=server)
     assert assessment["D"].success_percent > 90
 
 
-def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_errors_name_the_missing_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     policy = perturb.load_policy(CART_POLE)
     for module, call in (("torch", policy.to_torch), ("onnx", lambda: policy.to_onnx(tmp_path / "policy.onnx"))):
         with monkeypatch.context() as without:

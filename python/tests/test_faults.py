@@ -1,4 +1,7 @@
-"""If a client or server dies, hangs or forks, errors come within seconds, and nothing is left behind."""
+"""Clients and servers that die or hang, and processes that fork.
+
+Errors are raised within seconds, and no session, server process or temporary folder is left behind.
+"""
 
 from __future__ import annotations
 
@@ -83,7 +86,7 @@ def test_a_server_killed_in_mid_step_is_reported_at_once(listen: str | None, sta
         envs.reset()
 
 
-def test_a_reset_finds_a_server_that_runs_again(start_server: Callable[..., Any]) -> None:
+def test_a_reset_connects_to_a_restarted_server(start_server: Callable[..., Any]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
@@ -121,7 +124,7 @@ def test_parameters_of_some_environments_survive_a_lost_server(start_server: Cal
         np.testing.assert_array_equal(again["parameters"]["length"], infos["parameters"]["length"])
 
 
-def test_parameters_of_a_snapshot_are_not_forgotten_silently(start_server: Callable[..., Any]) -> None:
+def test_loss_of_a_snapshots_parameters_is_reported(start_server: Callable[..., Any]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
@@ -139,7 +142,7 @@ def test_parameters_of_a_snapshot_are_not_forgotten_silently(start_server: Calla
 
 @pytest.mark.parametrize("how", ["refused", "lost"])
 def test_a_restore_that_is_refused_changes_nothing(how: str, start_server: Callable[..., Any]) -> None:
-    """If the server is lost during a restore, the client does not know the parameters any more."""
+    """If the server is instead lost during a restore, the client no longer knows the parameters."""
     with tempfile.TemporaryDirectory() as directory:
         listen = f"unix:{directory}/server.sock"
         running = start_server(listen=listen)
@@ -160,7 +163,7 @@ def test_a_restore_that_is_refused_changes_nothing(how: str, start_server: Calla
                 env.reset(seed=1)
 
 
-def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> None:
+def test_a_server_that_hangs_is_reported_after_the_timeout(start_server: Callable[..., Any]) -> None:
     running = start_server()
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset(seed=1)
@@ -176,7 +179,7 @@ def test_a_server_that_hangs_is_given_up(start_server: Callable[..., Any]) -> No
     env.reset()
 
 
-def test_a_server_that_answers_no_pings_is_given_up(
+def test_a_server_that_answers_no_pings_is_reported(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A client sends pings to detect a dead server before the timeout of replies.
@@ -203,7 +206,7 @@ def test_an_address_without_a_perturb_server_is_reported() -> None:
             silent.reset()
 
 
-def test_shutdown_ends_sessions_with_the_servers_sentence(start_server: Callable[..., Any]) -> None:
+def test_shutdown_of_a_server_is_reported_as_a_lost_server(start_server: Callable[..., Any]) -> None:
     running = start_server("--grace-seconds", "0")
     env = perturb.PerturbEnv("CartPole", server=running.address)
     env.reset()
@@ -225,7 +228,7 @@ SEVERAL_MACHINES = """
 import os, sys
 import perturb
 statuses = []
-for _ in range(6):  # processes begin with different machines
+for _ in range(6):  # different processes may try the machines in different orders
     child = os.fork()
     if child == 0:
         env = perturb.PerturbEnv("CartPole", server=sys.argv[1])
@@ -237,13 +240,13 @@ print(statuses)
 """
 
 
-def test_of_several_machines_one_that_accepts_is_taken(start_server: Callable[..., Any], tmp_path: Path) -> None:
+def test_a_client_connects_to_a_machine_that_accepts_sessions(start_server: Callable[..., Any], tmp_path: Path) -> None:
     draining = start_server(listen="tcp://127.0.0.1:0")
     port = draining.address.rpartition(":")[2]
     start_server(listen=f"tcp://127.0.0.2:{port}")
     env = perturb.PerturbEnv("CartPole", server=draining.address)
     env.reset()
-    draining.process.terminate()  # the session keeps it running
+    draining.process.terminate()  # the open session keeps the draining server running
     hosts = tmp_path / "hosts"
     hosts.write_text("127.0.0.1 localhost machines.test\n127.0.0.2 machines.test\n")
     script = 'mount --bind "$0" /etc/hosts && exec "$@"'
@@ -334,14 +337,14 @@ print("ends")
 """
 
 
-def test_a_process_may_end_while_a_thread_of_it_steps(server: str) -> None:
+def test_a_process_may_end_while_one_of_its_threads_steps(server: str) -> None:
     for _ in range(3):
         process = python("-c", ENDING.format(address=server))
         assert process.communicate(timeout=60) == ("ends\n", "")
         assert process.returncode == 0
 
 
-def test_proxy_variables_do_not_reach_loopback_and_sockets(
+def test_proxy_variables_do_not_affect_loopback_and_sockets(
     start_server: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("http_proxy", "HTTP_PROXY", "https_proxy", "grpc_proxy", "all_proxy"):
@@ -367,7 +370,7 @@ def test_private_server_ends_with_last_environment() -> None:
     one.reset(seed=1)
     shared = private()
     assert shared is not None
-    assert os.getpgid(shared.process.pid) != os.getpgid(0), "Ctrl-C would end it"
+    assert os.getpgid(shared.process.pid) != os.getpgid(0), "Ctrl-C would also end the server"
     other.reset(seed=1)
     assert private() is shared
     one.close()
@@ -381,7 +384,7 @@ def test_private_server_ends_with_last_environment() -> None:
     assert not directory.exists()
 
 
-def test_a_forgotten_environment_gives_its_server_back() -> None:
+def test_private_server_ends_if_its_environment_is_garbage_collected() -> None:
     env = perturb.PerturbEnv("CartPole")
     env.reset()
     shared = private()
@@ -417,7 +420,7 @@ print("went on")
 """
 
 
-def test_collection_while_private_server_is_acquired() -> None:
+def test_garbage_collection_while_a_private_server_is_acquired() -> None:
     assert output_of("-c", FORGETTING) == ("went on\n", "")
 
 
@@ -508,7 +511,7 @@ def test_without_the_program_the_error_says_how_to_get_it(monkeypatch: pytest.Mo
         gymnasium.make("perturb/CartPole-v1")
 
 
-def test_the_packages_own_program_comes_before_that_on_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_packages_own_program_is_preferred_to_that_on_path(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     own, other = tmp_path / "own", tmp_path / "bin" / local_server.PROGRAM
     other.parent.mkdir()
     for program in (own, other):
@@ -525,13 +528,13 @@ def test_the_packages_own_program_comes_before_that_on_path(monkeypatch: pytest.
     assert local_server.find_program() == other
 
 
-def test_a_program_that_is_no_server_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_that_is_not_a_server_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(local_server.VARIABLE, "/bin/false")
     with within(SECONDS), pytest.raises(perturb.ServerStartError, match="ended with status 1 before it listened"):
         perturb.PerturbEnv("CartPole").reset()
 
 
-def test_settings_of_other_servers_do_not_reach_the_private_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_variables_for_other_servers_do_not_affect_private_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # a server with this setting does not start
     envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more environments than the default limit of a server
     envs.reset()
@@ -582,7 +585,7 @@ def test_session_opens_in_the_process_that_uses_it(own: bool, server: str) -> No
     used.reset(seed=1)
     assert in_fork(lambda: used.step(1)).startswith("OutOfOrderError: process")
     assert in_fork(both) == [expected, expected]
-    assert used.step(1)[0].tobytes() == expected, "the parent's session goes on"
+    assert used.step(1)[0].tobytes() == expected, "the fork does not affect the parent's session"
     used.close()
 
 
@@ -599,7 +602,7 @@ if child:
 """
 
 
-def test_a_forked_process_goes_on_beside_its_parent(server: str) -> None:
+def test_a_parent_and_its_forked_child_both_continue(server: str) -> None:
     assert output_of("-c", FORKING.format(address=server)) == ("both went on\n", "")
 
 

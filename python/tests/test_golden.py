@@ -1,4 +1,4 @@
-"""The classic tasks agree with trajectories of Gymnasium 1.4, in tests/server/data/classic_control.jsonl."""
+"""The classic tasks agree with trajectories of Gymnasium 1.4 (tests/server/data/classic_control.jsonl)."""
 
 from __future__ import annotations
 

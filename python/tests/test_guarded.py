@@ -55,7 +55,7 @@ NOT_ALLOWED = (
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Make a folder with valid and invalid certificates and tokens."""
     folder = tmp_path_factory.mktemp("guarded")
-    # The authority `strangers` has the same name as `clients`, and another key.
+    # The authority `strangers` has the same name as `clients`, but another key.
     servers, clients, strangers = (
         trustme.CA(organization_name="perturb", organization_unit_name=unit)
         for unit in ("servers", "clients", "clients")
@@ -135,7 +135,7 @@ def played(server: str) -> list[bytes]:
         pytest.param(MUTUAL_TLS | TOKENS, ALL, id="all"),
     ],
 )
-def test_a_client_with_credentials_plays_as_at_an_open_socket(
+def test_observations_are_the_same_with_and_without_credentials(
     asks: Files, has: Files, start: Callable[[Files], str], have: Callable[[Files], None], server: str
 ) -> None:
     address = start(asks)
@@ -192,7 +192,7 @@ def test_a_client_with_credentials_plays_as_at_an_open_socket(
         ),
     ],
 )
-def test_missing_credentials_are_named_and_can_be_added(
+def test_errors_name_missing_credentials_which_can_then_be_added(
     has: Files, says: str, guarded: str, have: Callable[[Files], None]
 ) -> None:
     have(has)
@@ -223,7 +223,7 @@ def test_a_server_with_an_invalid_certificate_is_refused(
         perturb.PerturbEnv("CartPole", server=address).reset()
 
 
-def test_an_address_with_the_wrong_scheme_is_refused_with_the_right_one(
+def test_the_refusal_of_a_wrong_scheme_names_the_right_one(
     guarded: str, start: Callable[[Files], str], have: Callable[[Files], None]
 ) -> None:
     have(ALL)
@@ -234,8 +234,8 @@ def test_an_address_with_the_wrong_scheme_is_refused_with_the_right_one(
         perturb.PerturbEnv("CartPole", server=f"https://{plain}").reset()
 
 
-def test_a_token_does_not_go_unencrypted_to_another_machine(have: Callable[[Files], None]) -> None:
-    """The client refuses before it connects. The address does not belong to a machine."""
+def test_a_token_is_not_sent_unencrypted_to_another_machine(have: Callable[[Files], None]) -> None:
+    """The client raises the error before it connects, so the test needs no machine with this address."""
     have(TOKEN)
     with pytest.raises(
         perturb.ServerConnectionError,
@@ -253,7 +253,7 @@ def test_a_unix_socket_needs_no_credentials(have: Callable[[Files], None], serve
         env.close()
 
 
-def test_what_a_role_may_not_draw_from_is_refused(guarded: str, have: Callable[[Files], None]) -> None:
+def test_versions_and_parameters_that_a_role_excludes_are_refused(guarded: str, have: Callable[[Files], None]) -> None:
     have(ALL)
     settings: list[dict[str, Any]] = [{"version": "E"}, {"version": "R+E"}, EXTREME]
     for wrong in settings:

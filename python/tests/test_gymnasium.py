@@ -44,7 +44,7 @@ def test_gymnasiums_checker_accepts_all_environments(name: str, version: str, se
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_papers_ids_are_the_versions(name: str, server: str) -> None:
+def test_the_papers_ids_select_the_versions(name: str, server: str) -> None:
     for version, suffix in {"D": "", "R": "RandomNormal", "E": "RandomExtreme"}.items():
         old = gymnasium.make(f"Sunblaze{name}{suffix}-v0", server=server)
         new = gymnasium.make(identifier(name), version=version, server=server)
@@ -99,7 +99,7 @@ def test_batch_equals_gymnasiums_vector_of_singles(name: str, mode: AutoresetMod
             assert equal(a[2], b[2]), step
             assert equal(a[3], b[3]), step
             ended += int((a[2] | a[3]).sum())
-    assert ended > 3, "the test saw no endings"
+    assert ended > 3, "too few episodes ended"
     ours.close()
     theirs.close()
 
@@ -158,7 +158,7 @@ def test_gymnasiums_wrappers_work_on_batches(mode: AutoresetMode, server: str) -
     wrapped.close()
 
 
-def test_two_environments_of_one_seed_match(server: str) -> None:
+def test_environments_with_the_same_seed_match(server: str) -> None:
     from gymnasium.utils.env_match import check_environments_match
 
     a = gymnasium.make("perturb/Hopper-v0", version="E", server=server)
@@ -168,7 +168,7 @@ def test_two_environments_of_one_seed_match(server: str) -> None:
     b.close()
 
 
-def test_random_numbers_are_those_of_the_documents(server: str) -> None:
+def test_random_numbers_equal_those_in_the_documentation(server: str) -> None:
     """The example in docs/random-streams.md has seed 7, environment 3 and trial 2 of CartPole E."""
     env = gymnasium.make("perturb/CartPole-v1", version="E", environment_index=3, server=server)
     env.reset(seed=7)
@@ -183,7 +183,7 @@ def test_random_numbers_are_those_of_the_documents(server: str) -> None:
     env.close()
 
 
-def test_what_gymnasium_asks_of_batches_holds_for_seeds(server: str) -> None:
+def test_seeds_of_a_batch_follow_gymnasiums_rules(server: str) -> None:
     envs = gymnasium.make_vec("perturb/Pendulum-v1", num_envs=3, version="R", server=server)
     by_number, _ = envs.reset(seed=10)
     by_list, _ = envs.reset(seed=[10, 11, 12])  # type: ignore[arg-type]

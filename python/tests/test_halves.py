@@ -28,7 +28,7 @@ def make(server: str, **settings: Any) -> perturb.PerturbVectorEnv:
 
 @pytest.mark.parametrize("ahead", [1, 7, 64])
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_halves_make_the_steps_that_whole_ones_make(mode: AutoresetMode, ahead: int, server: str) -> None:
+def test_send_and_recv_return_what_step_returns(mode: AutoresetMode, ahead: int, server: str) -> None:
     whole, halves = (make(server, autoreset_mode=mode, reward_terms=True) for _ in range(2))
     sent, ended = 0, 0
     for step in range(len(ACTIONS)):
@@ -42,7 +42,7 @@ def test_halves_make_the_steps_that_whole_ones_make(mode: AutoresetMode, ahead: 
     assert halves.reset(seed=9)[0].tobytes() == whole.reset(seed=9)[0].tobytes()
 
 
-def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., Any]) -> None:
+def test_sent_step_is_computed_before_recv_is_called(start_server: Callable[..., Any]) -> None:
     address = start_server("--workers", "1").address
     envs = [perturb.PerturbVectorEnv("HalfCheetah", 256, server=address) for _ in range(2)]
     actions = np.zeros((256, 6), dtype=np.float32)
@@ -50,7 +50,7 @@ def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., A
         batch.reset(seed=1)
 
     def seconds(think: float) -> list[float]:
-        """Return the times that `recv` takes, each `think` seconds after `send`."""
+        """Measure five times how long `recv` takes for both batches, `think` seconds after `send`."""
         taken = []
         for _ in range(5):
             for batch in envs:
@@ -66,7 +66,7 @@ def test_sent_step_is_computed_before_anyone_waits(start_server: Callable[..., A
     assert min(seconds(0.1 + 4 * computing)) < computing / 2
 
 
-def test_the_error_of_a_step_comes_from_its_own_recv(server: str) -> None:
+def test_recv_raises_the_error_of_its_own_step(server: str) -> None:
     envs, twin = (perturb.PerturbVectorEnv("Pendulum", 2, server=server) for _ in range(2))
     envs.reset(seed=1)
     twin.reset(seed=1)
@@ -82,7 +82,7 @@ def test_the_error_of_a_step_comes_from_its_own_recv(server: str) -> None:
     assert envs.step(good)[0].tobytes() == twin.step(good)[0].tobytes()
 
 
-def test_halves_out_of_order_are_refused_and_change_nothing(server: str) -> None:
+def test_send_and_recv_out_of_order_are_refused_and_change_nothing(server: str) -> None:
     envs = perturb.PerturbVectorEnv("CartPole", 4, server=server)
     calls: list[Callable[[], object]] = [envs.recv, lambda: envs.send(ACTIONS[0])]
     for call in calls:

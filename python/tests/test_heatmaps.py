@@ -13,7 +13,7 @@ from .test_policy import CART_POLE, PENDULUM
 
 
 @pytest.mark.parametrize("checkpoint", [CART_POLE, PENDULUM])
-def test_a_test_over_two_parameters_is_that_of_the_program(checkpoint: Path, tmp_path: Path, server: str) -> None:
+def test_python_and_the_program_record_the_same_heatmap(checkpoint: Path, tmp_path: Path, server: str) -> None:
     made = str(tmp_path / "made")
     arguments = (
         "--grid",
@@ -53,7 +53,7 @@ def test_reports_show_the_heatmap_of_an_assessment(tmp_path: Path, server: str) 
     assert "mean return and success over" not in without.to_html()
 
 
-def test_points_that_cannot_be_are_refused() -> None:
+def test_wrong_axes_and_numbers_of_points_are_refused() -> None:
     assert len(perturb.sets.heatmap("Hopper").contexts or ()) == 100
     with pytest.raises(perturb.UnknownNameError, match="no parameter 'width'"):
         perturb.sets.heatmap("CartPole", "width")

@@ -33,12 +33,12 @@ def test_infos_are_plain_dictionaries_of_arrays(mode: AutoresetMode, server: str
                 assert isinstance(value, dict | np.ndarray), key
                 assert one[f"_{key.removeprefix('_')}"].shape == (16,)
         if "parameters" in infos:
-            told = infos["_parameters"]
+            begun = infos["_parameters"]
             for name, values in infos["receipt"]["applied"].items():
                 if not name.startswith("_") and name in infos["parameters"]:
-                    np.testing.assert_allclose(values[told], infos["parameters"][name][told], rtol=1e-9)
-                    seen += int(told.sum())
-            assert infos["context_id"][told].tolist() == infos["receipt"]["trial_index"][told].tolist()
+                    np.testing.assert_allclose(values[begun], infos["parameters"][name][begun], rtol=1e-9)
+                    seen += int(begun.sum())
+            assert infos["context_id"][begun].tolist() == infos["receipt"]["trial_index"][begun].tolist()
             assert infos["receipt"]["model_hash"].shape == (16, 32)
             assert not infos["receipt"]["model_hash"].any(), "CartPole has no model"
         *_, terminated, truncated, infos = envs.step(np.ones(16, dtype=np.int64))
@@ -48,7 +48,7 @@ def test_infos_are_plain_dictionaries_of_arrays(mode: AutoresetMode, server: str
     envs.close()
 
 
-def test_readers_in_c_see_all_of_infos(server: str) -> None:
+def test_json_pickle_and_dict_read_all_of_infos(server: str) -> None:
     envs = perturb.PerturbVectorEnv("CartPole", 3, version="R", server=server)
     _, infos = envs.reset(seed=1)
     read = json.loads(json.dumps(infos["parameters"], default=lambda array: array.tolist()))
@@ -58,7 +58,7 @@ def test_readers_in_c_see_all_of_infos(server: str) -> None:
     assert list(rebuilt) == list(infos["receipt"])
 
 
-def test_infos_have_numbers_alone(server: str) -> None:
+def test_infos_contain_only_numbers(server: str) -> None:
     """Wrappers that convert arrays, such as Gymnasium's NumpyToTorch, cannot convert text or objects."""
     expected = bytes.fromhex(perturb.environments()["Hopper"].model_hash)
     assert len(expected) == 32
@@ -79,8 +79,8 @@ def test_infos_have_numbers_alone(server: str) -> None:
     envs.close()
 
 
-def test_achieved_is_there_at_each_end(server: str) -> None:
-    """`achieved` without a value is NaN, not absent: stable-baselines3's Monitor needs its keys at each end."""
+def test_infos_have_achieved_at_the_end_of_each_episode(server: str) -> None:
+    """Without a value, `achieved` is NaN instead of absent, because stable-baselines3's Monitor requires the key."""
     env = gymnasium.make(identifier("MountainCar"), server=server)
     env.reset(seed=1)
     info: dict[str, Any] = {}

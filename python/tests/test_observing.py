@@ -25,7 +25,7 @@ def seen(entry: dict[str, Any], applied: dict[str, Any]) -> list[np.float32]:
     return scaled
 
 
-@pytest.mark.filterwarnings("ignore")  # warnings about spaces, as for observations without parameters
+@pytest.mark.filterwarnings("ignore")  # warnings about spaces, also without observed parameters
 @pytest.mark.parametrize("entry", ENTRIES, ids=lambda entry: entry["name"])
 def test_observed_parameters_are_in_observation_and_space(entry: dict[str, Any], server: str) -> None:
     settings: dict[str, Any] = {"version": "E", "server": server}
@@ -46,7 +46,7 @@ def test_observed_parameters_are_in_observation_and_space(entry: dict[str, Any],
     plain.close()
 
 
-def test_batch_has_parameters_of_each_episode_at_its_end(server: str) -> None:
+def test_observations_of_a_batch_end_with_the_parameters_of_each_episode(server: str) -> None:
     entry = ENTRIES[0]
     settings: dict[str, Any] = {"version": "R", "autoreset_mode": "SameStep", "server": server}
     envs = gymnasium.make_vec(identifier(entry["name"]), num_envs=4, observe="parameters", **settings)

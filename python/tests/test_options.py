@@ -39,7 +39,7 @@ def test_the_package_has_the_version_of_the_server() -> None:
 
 
 @pytest.mark.socket
-def test_the_catalogue_is_the_servers(server: str) -> None:
+def test_the_catalogue_equals_that_of_the_server(server: str) -> None:
     served = json.loads(_native.catalogue(server, 10.0))["environments"]
     assert [environment["name"] for environment in served] == list(CATALOGUE)
     for environment in served:
@@ -74,7 +74,7 @@ def test_new_environment_needs_no_change_of_the_package(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.uint8, np.array])
-def test_seeds_may_be_numpys(kind: Any, server: str) -> None:
+def test_seeds_may_be_numpy_integers_or_arrays(kind: Any, server: str) -> None:
     env, envs = make(server=server), make_vec(num_envs=3, server=server)
     expected, _ = env.reset(seed=11)
     assert env.reset(seed=kind(11))[0].tobytes() == expected.tobytes()
@@ -98,7 +98,7 @@ def test_seeds_may_be_numpys(kind: Any, server: str) -> None:
         (np.array([[5.0, 6.0], [8.0, 9.0]]), [(5, 6), (8, 9)]),
     ],
 )
-def test_a_parameter_is_a_value_an_interval_or_several(
+def test_a_parameter_is_a_value_an_interval_or_several_intervals(
     given: Any, intervals: list[tuple[float, float]], server: str
 ) -> None:
     at_make = make(parameters={"force": given}, server=server)
@@ -116,7 +116,7 @@ def test_a_parameter_is_a_value_an_interval_or_several(
     assert all(any(low <= force <= high for low, high in intervals) for force in seen)
 
 
-def test_parameters_of_a_reset_stay(server: str) -> None:
+def test_parameters_of_a_reset_also_apply_to_later_resets(server: str) -> None:
     env = make(version="R", server=server)
     env.reset(options={"parameters": {"mass": 0.25}})
     _, first = env.reset()
@@ -125,7 +125,7 @@ def test_parameters_of_a_reset_stay(server: str) -> None:
     assert first["parameters"]["force"] != second["parameters"]["force"]
 
 
-def test_a_trial_of_r_and_e_is_all_of_one_of_them(server: str) -> None:
+def test_a_trial_of_r_plus_e_draws_all_parameters_from_the_same_version(server: str) -> None:
     envs = make_vec(num_envs=60, version="R+E", server=server)
     parameters = envs.reset(seed=4)[1]["parameters"]
     of_r = [
@@ -144,7 +144,7 @@ def test_trials_keep_parameters(server: str) -> None:
     assert infos[0]["parameters"] == infos[1]["parameters"] != infos[2]["parameters"]
 
 
-def test_an_exact_state_is_where_the_episode_begins(server: str) -> None:
+def test_an_episode_begins_in_the_state_of_the_reset(server: str) -> None:
     state = [1.25, -0.5, 0.125, 0.75]
     observation, _ = make(server=server).reset(options={"state": state})
     assert observation.tolist() == state
@@ -153,7 +153,7 @@ def test_an_exact_state_is_where_the_episode_begins(server: str) -> None:
     assert envs.reset(options={"state": states})[0].tolist() == states.tolist()
 
 
-def test_a_mask_resets_some(server: str) -> None:
+def test_a_mask_selects_the_environments_to_reset(server: str) -> None:
     envs = make_vec(num_envs=3, autoreset_mode=AutoresetMode.DISABLED, version="R", server=server)
     before, _ = envs.reset(seed=1)
     mask = np.array([False, True, False])
@@ -169,7 +169,7 @@ def test_a_mask_resets_some(server: str) -> None:
     assert same.reset(seed=51)[1]["parameters"]["mass"] == infos["parameters"]["mass"][1]
 
 
-def test_receipts_and_terms_come_on_request(server: str) -> None:
+def test_receipts_and_reward_terms_are_optional(server: str) -> None:
     env = make("Hopper", receipts=False, reward_terms=True, server=server)
     assert env.reset(seed=1)[1] == {}
     _, reward, _, _, info = env.step(np.full(3, 0.5, dtype=np.float32))
@@ -181,7 +181,7 @@ def test_receipts_and_terms_come_on_request(server: str) -> None:
     assert env.step(0)[4] == {}
 
 
-def test_a_snapshot_is_followed_by_the_same_bytes(server: str) -> None:
+def test_steps_from_a_restored_snapshot_give_the_same_bytes(server: str) -> None:
     env, other = make("Hopper", version="E", server=server), make("Hopper", server=server)
     env.reset(seed=3)
     actions = np.random.default_rng(0).uniform(-0.2, 0.2, (20, 3)).astype(np.float32)
@@ -221,7 +221,7 @@ def long_snapshots() -> dict[str, list[tuple[float, float]]]:
     [("Hopper", 8500, None, 4 << 20), ("CartPole", 5600, long_snapshots(), 64 << 20)],
     ids=["grpcs_default_limit", "the_limit_of_a_request"],
 )
-def test_long_snapshots_are_followed_by_the_same_bytes(
+def test_steps_from_restored_long_snapshots_give_the_same_bytes(
     name: str, num_envs: int, parameters: Any, limit: int, server: str
 ) -> None:
     envs = make_vec(name, num_envs=num_envs, parameters=parameters, server=server)
@@ -244,7 +244,7 @@ def test_long_snapshots_are_followed_by_the_same_bytes(
     envs.close()
 
 
-def test_a_restore_whose_later_part_is_refused_is_remembered(server: str) -> None:
+def test_a_partly_refused_restore_counts_as_a_restore(server: str) -> None:
     """A long restore is sent in several requests. If a later request is refused, the earlier ones have been applied."""
     envs = make_vec("Hopper", num_envs=8192, server=server)
     envs.reset(seed=3)
@@ -256,7 +256,7 @@ def test_a_restore_whose_later_part_is_refused_is_remembered(server: str) -> Non
     envs.close()
 
 
-def test_observations_stay_as_they_are(server: str) -> None:
+def test_later_steps_do_not_overwrite_observations(server: str) -> None:
     for is_copied in (False, True):
         envs = make_vec(num_envs=4, copy=is_copied, server=server)
         kept = [envs.reset(seed=1)[0]]
@@ -272,7 +272,7 @@ def test_observations_stay_as_they_are(server: str) -> None:
     assert env.step(0)[0].flags.writeable
 
 
-def test_changed_observations_do_not_change_masked_resets(server: str) -> None:
+def test_overwritten_observations_do_not_affect_masked_resets(server: str) -> None:
     envs = make_vec(num_envs=2, autoreset_mode=AutoresetMode.DISABLED, server=server)
     observations, _ = envs.reset(seed=1)
     expected = observations[1].tolist()

@@ -1,4 +1,4 @@
-"""A process that was paused loses its session, and the error says why."""
+"""A client process that was stopped for too long loses its session, and the error says why."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def paused(address: str, seconds: float) -> list[str]:
         ("--idle-seconds", "the session was idle for 1 s"),
     ],
 )
-def test_lost_session_of_a_paused_process_says_why(flag: str, says: str, start_server: Callable[..., Any]) -> None:
+def test_error_after_a_pause_names_its_cause(flag: str, says: str, start_server: Callable[..., Any]) -> None:
     address = start_server(flag, "1", listen="tcp://127.0.0.1:0").address
     lost, again = paused(address, 5)
     assert lost.startswith("ServerConnectionError lost the server at")
@@ -69,5 +69,5 @@ def test_lost_session_of_a_paused_process_says_why(flag: str, says: str, start_s
     assert ("did not run" in lost) == (flag == "--keepalive-seconds")
 
 
-def test_short_pause_costs_nothing(start_server: Callable[..., Any]) -> None:
+def test_short_pause_does_not_end_the_session(start_server: Callable[..., Any]) -> None:
     assert paused(start_server(listen="tcp://127.0.0.1:0").address, 1.5) == ["stepped"]

@@ -1,4 +1,4 @@
-"""Policies and assessments can be pickled, and so sent to other processes."""
+"""Policies and assessments can be pickled, and therefore be sent to other processes."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_pickled_policy_is_the_same(again: Any, tmp_path: Path) -> None:
     assert act(other) == act(policy)
 
 
-def test_an_actor_pickles_before_its_first_action() -> None:
+def test_an_actor_can_be_pickled_only_before_its_first_action() -> None:
     actor = perturb.load_policy(CART_POLE).actor(8, seed=3)
     other = pickle.loads(pickle.dumps(actor))
     assert other(ROWS).tolist() == actor(ROWS).tolist()

@@ -31,7 +31,7 @@ def spoil(folder: Path, old: str, new: str) -> None:
     (folder / "checkpoint.json").write_text(document.replace(old, new, 1))
 
 
-def test_a_policy_says_what_it_is(tmp_path: Path) -> None:
+def test_the_attributes_of_a_policy_describe_it(tmp_path: Path) -> None:
     policy = perturb.load_policy(PENDULUM)
     assert (policy.environment, policy.version, policy.trained_on) == ("Pendulum", "R", "R")
     assert (policy.method, policy.observe, policy.seed) == ("ppo ff", "state", 8)
@@ -44,7 +44,7 @@ def test_a_policy_says_what_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("path", "shape", "kind"), [(CART_POLE, (3,), np.int64), (PENDULUM, (3, 1), np.float32)])
-def test_an_actor_samples_what_its_seed_indices_and_trials_say(path: Path, shape: tuple[int, ...], kind: type) -> None:
+def test_the_actions_of_an_actor_depend_on_its_seed_and_indices(path: Path, shape: tuple[int, ...], kind: type) -> None:
     policy = perturb.load_policy(path)
     rng = np.random.default_rng(1)
     # Observations for which no action has a probability near 1.
@@ -64,7 +64,7 @@ def test_an_actor_samples_what_its_seed_indices_and_trials_say(path: Path, shape
     assert (act(policy.actor(3, seed=6)) != first).any()
 
 
-def test_an_actor_refuses_what_it_cannot_see(copied: Path) -> None:
+def test_an_actor_refuses_wrong_inputs(copied: Path) -> None:
     policy = perturb.load_policy(copied)
     actor = policy.actor(2)
     wrongs: list[tuple[Any, str]] = [
@@ -87,7 +87,7 @@ def test_an_actor_refuses_what_it_cannot_see(copied: Path) -> None:
             policy.actor(count)
 
 
-def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shipped_policy_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
     results = Path(__file__).parents[2] / "results"
     monkeypatch.setenv("PERTURB_RESULTS", str(results))
     policy = perturb.load_policy("CartPole-ppo-ff-R-9bd6546b-s7")
@@ -98,7 +98,7 @@ def test_a_policy_of_results_is_loaded_by_its_name(monkeypatch: pytest.MonkeyPat
         perturb.load_policy("CartPole-ppo-ff-R")
 
 
-def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_path: Path) -> None:
+def test_errors_about_wrong_checkpoints_say_what_is_wrong(copied: Path, tmp_path: Path) -> None:
     with pytest.raises(perturb.PolicyError, match=r"holds no checkpoint: expected checkpoint\.json"):
         perturb.load_policy(tmp_path / "nothing")
     with pytest.raises(perturb.InvalidArgumentError, match="path is 7"):
@@ -108,7 +108,7 @@ def test_what_is_no_checkpoint_is_refused_with_what_is_wrong(copied: Path, tmp_p
         perturb.load_policy(copied)
 
 
-def test_damage_is_named(copied: Path) -> None:
+def test_errors_name_damaged_files_of_a_checkpoint(copied: Path) -> None:
     weights = copied / json.loads((copied / "checkpoint.json").read_text())["weights"]["file"]
     content = weights.read_bytes()
     weights.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))

@@ -24,7 +24,7 @@ Answer = pb.SessionResponse
 
 
 class FakeServer:
-    """A fake server that answers the requests of a session with the functions or messages in `answers`."""
+    """A fake server. Each item of `answers` answers one request of a session: a message, or a list of messages."""
 
     def __init__(self, method: str = "Session") -> None:
         self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
@@ -87,8 +87,11 @@ def fake() -> Iterator[FakeServer]:
     server.end()
 
 
-def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> None:
-    """The fake server works without a violation, so the tests below fail only because of their violation."""
+def test_a_server_that_keeps_to_the_protocol_is_accepted(fake: FakeServer) -> None:
+    """The client accepts a fake server that keeps to the protocol.
+
+    Each refusal in the tests below is therefore due to that test's violation.
+    """
     fake.answers = [Answer(opened=opened()), Answer(stepped=stepped())]
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
@@ -97,7 +100,7 @@ def test_a_server_that_keeps_to_the_protocol_is_understood(fake: FakeServer) -> 
 
 
 @pytest.mark.parametrize(("outcome", "achieved"), [({"achieved": 0.5}, 0.5), ({}, NAN)])
-def test_the_achieved_value_is_reported_or_nan(outcome: dict[str, float], achieved: float, fake: FakeServer) -> None:
+def test_achieved_is_the_reported_value_or_nan(outcome: dict[str, float], achieved: float, fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened()), Answer(stepped=ended(**outcome))] * 2
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
@@ -116,7 +119,7 @@ def test_server_without_observed_parameters_is_refused(fake: FakeServer) -> None
         perturb.PerturbEnv("CartPole", server=fake.address, observe="parameters").reset()
 
 
-def test_another_revision_is_refused(fake: FakeServer) -> None:
+def test_another_revision_of_an_environment_is_refused(fake: FakeServer) -> None:
     other = opened()
     other.environment.revision = 3
     fake.answers = [Answer(opened=other)]
@@ -167,7 +170,7 @@ def floats(*numbers: float) -> bytes:
         ({"ended": [pb.EpisodeEnd()], "final_observations": bytes(16)}, "slot 0, which is not flagged as ended"),
     ],
 )
-def test_replies_that_cannot_be_believed_are_refused(fields: dict[str, Any], says: str, fake: FakeServer) -> None:
+def test_replies_with_impossible_values_are_refused(fields: dict[str, Any], says: str, fake: FakeServer) -> None:
     good = {"observations": bytes(16), "rewards": bytes(4), "terminated": bytes(1), "truncated": bytes(1)}
     fake.answers = [Answer(opened=opened()), Answer(stepped=pb.Stepped(**{**good, **fields}))]
     env = perturb.PerturbEnv("CartPole", server=fake.address)
@@ -202,7 +205,7 @@ def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
         env.step(0)
 
 
-def test_a_defect_of_the_server_costs_the_session(fake: FakeServer) -> None:
+def test_a_defect_of_the_server_ends_the_session(fake: FakeServer) -> None:
     fake.answers = [Answer(opened=opened()), Answer(error=pb.Error(code=13, message="a worker died"))]
     env = perturb.PerturbEnv("CartPole", server=fake.address)
     env.reset()
@@ -226,7 +229,7 @@ def test_a_defect_of_the_server_costs_the_session(fake: FakeServer) -> None:
         (2, perturb.ProtocolError),
     ],
 )
-def test_a_refusal_costs_nothing(code: int, error: type[Exception], fake: FakeServer) -> None:
+def test_a_refusal_does_not_end_the_session(code: int, error: type[Exception], fake: FakeServer) -> None:
     refused = Answer(error=pb.Error(code=code, message="the reason"))
     fake.answers = [Answer(opened=opened()), refused, Answer(stepped=stepped())]
     env = perturb.PerturbEnv("CartPole", server=fake.address)
@@ -246,14 +249,14 @@ def test_a_stream_that_ends_is_reported(fake: FakeServer) -> None:
         env.step(0)
 
 
-def test_another_service_is_no_perturb_server() -> None:
+def test_a_server_of_another_service_is_refused() -> None:
     other = FakeServer("SomethingElse")
     with pytest.raises(perturb.ProtocolError, match="not a perturb-server"):
         perturb.PerturbEnv("CartPole", server=other.address).reset()
     other.end()
 
 
-def drawn(env: perturb.PerturbEnv, fake: FakeServer, *answers: Any) -> perturb.PerturbEnv:
+def reset_with_answers(env: perturb.PerturbEnv, fake: FakeServer, *answers: Any) -> perturb.PerturbEnv:
     fake.answers = [Answer(opened=opened()), *answers]
     env.reset()
     return env
@@ -266,9 +269,9 @@ def drawn(env: perturb.PerturbEnv, fake: FakeServer, *answers: Any) -> perturb.P
         (3, "request is empty or of a kind this server does not know", "may be older than this package: request is"),
     ],
 )
-def test_a_server_that_cannot_draw_says_so_and_steps_on(code: int, message: str, says: str, fake: FakeServer) -> None:
+def test_a_session_continues_after_a_failed_render(code: int, message: str, says: str, fake: FakeServer) -> None:
     env = perturb.PerturbEnv("CartPole", server=fake.address, render_mode="rgb_array")
-    drawn(env, fake, Answer(error=pb.Error(code=code, message=message)), Answer(stepped=stepped()))
+    reset_with_answers(env, fake, Answer(error=pb.Error(code=code, message=message)), Answer(stepped=stepped()))
     with pytest.raises(perturb.RenderError, match=says) as caught:
         env.render()
     assert isinstance(caught.value, RuntimeError)
@@ -287,7 +290,7 @@ def test_a_server_that_cannot_draw_says_so_and_steps_on(code: int, message: str,
 def test_a_picture_of_another_size_is_refused(rendered: Any, fake: FakeServer) -> None:
     env = perturb.PerturbEnv("CartPole", server=fake.address, render_mode="rgb_array", width=20, height=16)
     good = pb.Rendered(pixels=bytes(range(240)) * 4, width=20, height=16)
-    picture = drawn(env, fake, Answer(render=good), Answer(render=rendered)).render()
+    picture = reset_with_answers(env, fake, Answer(render=good), Answer(render=rendered)).render()
     assert picture.shape == (16, 20, 3)
     assert picture[0, 1].tolist() == [3, 4, 5]
     assert picture[1, 0].tolist() == [60, 61, 62]

@@ -46,7 +46,7 @@ def test_gymnasiums_checker_accepts_all_pictures(name: str, server: str) -> None
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_picture_shows_the_state_and_nothing_else(name: str, server: str) -> None:
+def test_a_picture_depends_only_on_the_state(name: str, server: str) -> None:
     env, twin = make(name, server), make(name, server)
     for one in (env, twin):
         one.reset(seed=1)
@@ -78,7 +78,7 @@ def test_drawing_changes_nothing(name: str, server: str) -> None:
         assert drawn.step(action)[0].tobytes() == plain.step(action)[0].tobytes()
 
 
-def test_parameters_are_seen(server: str) -> None:
+def test_pictures_show_parameters(server: str) -> None:
     def picture(length: float) -> Picture:
         env = make("CartPole", server, parameters={"length": length})
         env.reset(seed=1, options={"state": [0, 0, 0.1, 0]})
@@ -99,7 +99,7 @@ def test_the_end_of_an_episode_can_be_drawn(server: str) -> None:
     assert differ(end, start)
 
 
-def test_the_size_is_the_one_that_was_asked_for(server: str) -> None:
+def test_pictures_have_the_requested_size(server: str) -> None:
     env = perturb.PerturbEnv("Pendulum", server=server, render_mode="rgb_array")
     env.reset(seed=1)
     assert env.render().shape == (480, 480, 3)
@@ -110,12 +110,12 @@ def test_the_size_is_the_one_that_was_asked_for(server: str) -> None:
 
 
 def test_the_frame_rate_is_that_of_the_simulation(server: str) -> None:
-    """The number of frames per second follows from the lengths of steps in docs/environments.md."""
+    """The frame rate is the inverse of the control timestep, which docs/environments.md lists for each environment."""
     frames = {"CartPole": 50, "MountainCar": 1, "Acrobot": 5, "Pendulum": 20, "HalfCheetah": 60.6, "Hopper": 60.6}
     for name, expected in frames.items():
         metadata = gymnasium.make(identifier(name), server=server, **SMALL).metadata
         assert metadata["render_modes"] == ["rgb_array"]
-        assert metadata["render_fps"] == pytest.approx(expected, abs=0.01)  # the robots' is 60.606…
+        assert metadata["render_fps"] == pytest.approx(expected, abs=0.01)  # 60.606… for the robots
     envs = gymnasium.make_vec("perturb/CartPole-v1", num_envs=2, server=server, **SMALL)
     assert envs.metadata["render_fps"] == 50
     assert envs.render_mode == "rgb_array"
@@ -149,7 +149,7 @@ def test_a_batch_gives_one_picture_of_each_environment(copy: bool, server: str) 
     assert differ(pictures[1], pictures[2])
 
 
-def test_gymnasiums_wrappers_take_the_pictures(server: str) -> None:
+def test_gymnasiums_wrappers_accept_pictures(server: str) -> None:
     collected = gymnasium.make("perturb/CartPole-v1", server=server, **{**SMALL, "render_mode": "rgb_array_list"})
     collected.reset(seed=1)
     for _ in range(3):
@@ -195,7 +195,7 @@ def test_without_opengl_only_classic_tasks_are_drawn(
     assert classic.render().any()
 
 
-def test_human_rendering_is_gymnasiums(server: str) -> None:
+def test_human_mode_is_refused_with_a_hint_at_gymnasiums_wrapper(server: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="HumanRendering"):
         perturb.PerturbVectorEnv("CartPole", 2, server=server, render_mode="human")
 

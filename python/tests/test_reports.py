@@ -31,18 +31,18 @@ def rows(page: str, part: str) -> list[str]:
     return [row for row in re.findall(r"<tr[^>]*>.*?</tr>", page, re.DOTALL) if part in row]
 
 
-def test_page_of_agent_alone_has_no_experiment(assessment: perturb.Assessment, tmp_path: Path) -> None:
+def test_a_report_without_an_experiment_shows_only_the_agent(assessment: perturb.Assessment, tmp_path: Path) -> None:
     page = assessment.to_html(tmp_path / "page.html")
     assert (tmp_path / "page.html").read_text("utf-8") == page
     assert page == assessment.to_html()
     assert "cells are done" not in page
-    assert page.count("<svg") == 4, "the finding; over parameters, trained on D and on R; profiles"
+    assert page.count("<svg") == 4, "1 figure of the finding, 2 over parameters (trained on D and R), 1 of profiles"
     metrics = rows(page, "pushes (trained elsewhere)")[0]
     assert f">{assessment['DD'].success_percent:.1f}<" in metrics
     assert page.count("steps of training not known") == 2
 
 
-def test_beside_an_experiment_the_agent_stands_in_its_tables(
+def test_a_report_beside_an_experiment_has_the_agent_in_its_tables(
     assessment: perturb.Assessment, tmp_path: Path, server: str
 ) -> None:
     assessment.save(tmp_path / "saved")
@@ -65,12 +65,12 @@ def test_beside_an_experiment_the_agent_stands_in_its_tables(
         str(tmp_path / "page"),
     )
     alone = perturb.Assessment.load(tmp_path / "saved").to_html(beside=[EXPERIMENT])
-    assert (tmp_path / "page").read_text("utf-8") == alone, "the program's page is the same"
+    assert (tmp_path / "page").read_text("utf-8") == alone, "the program writes the same page"
     assert "pushes,,,true,Default" in (tmp_path / "out/metrics.csv").read_text("utf-8")
     assert "saved as <code>saved</code>" in alone
 
 
-def test_what_cannot_be_reported_is_refused(assessment: perturb.Assessment, tmp_path: Path) -> None:
+def test_wrong_arguments_of_reports_are_refused(assessment: perturb.Assessment, tmp_path: Path) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="neither an experiment"):
         assessment.to_html(beside=[tmp_path])
     with pytest.raises(perturb.InvalidArgumentError, match="expected a list"):
@@ -104,7 +104,7 @@ def test_audit_accepts_the_same_policy_and_finds_another(tmp_path: Path, server:
         loaded.audit({"D": upright}, server=server)
 
 
-def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str) -> None:
+def test_python_and_the_program_audit_checkpoints(tmp_path: Path, server: str) -> None:
     other = POLICIES / "CartPole-ppo-ff-R-9bd6546b-s7.safetensors"
     trained = {"D": perturb.load_policy(CART_POLE), "E": upright, "R": perturb.load_policy(other)}
     assessment = perturb.evaluate(trained, "CartPole", episodes=20, server=server)
@@ -123,7 +123,7 @@ def test_perturbs_own_policies_are_replayed_by_both(tmp_path: Path, server: str)
     assert "no policy of" in output
 
 
-def test_worst_contexts_are_those_that_fail(server: str) -> None:
+def test_worst_contexts_are_those_with_the_lowest_success_rates(server: str) -> None:
     sets: list[Any] = [perturb.sets.listed("poles", [{"length": length} for length in (0.05, 0.5, 1.0)]), "E"]
     assessment = perturb.evaluate(upright, "CartPole", versions=sets, episodes=90, server=server)
     worst = assessment.worst_contexts("poles")
@@ -141,7 +141,7 @@ def test_worst_contexts_are_those_that_fail(server: str) -> None:
 
 
 def test_bootstrap_intervals_match_spread_of_episodes(assessment: perturb.Assessment) -> None:
-    assert assessment["DD"].return_interval == (200.0, 200.0), "all are alike"
+    assert assessment["DD"].return_interval == (200.0, 200.0), "all episodes have the same return"
     columns = assessment.columns()
     for scenario in ("DE", "RE"):
         result = assessment[scenario]
@@ -173,7 +173,7 @@ def test_success_over_two_parameters_counts_every_episode(assessment: perturb.As
     assert assessment.success_by_parameters("DD", "length", "mass") == ()
 
 
-def test_pictures_are_drawn_where_matplotlib_is(
+def test_plots_are_drawn_if_matplotlib_is_installed(
     assessment: perturb.Assessment, server: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as without:
@@ -184,10 +184,10 @@ def test_pictures_are_drawn_where_matplotlib_is(
     matplotlib.use("Agg")
     axes = assessment.plot_curves("length")
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
-    assert labels == ["DR", "DE", "RR", "RE"], "on D it does not vary"
+    assert labels == ["DR", "DE", "RR", "RE"], "on D the length does not vary"
     assert axes.get_xlabel() == "length, m"
     gaps = axes.get_lines()[1].get_ydata()
-    assert np.isnan(gaps).sum() >= 1, "E's two intervals"
+    assert np.isnan(gaps).sum() >= 1, "there is a gap between the two intervals of E"
     axes = assessment.plot_heatmap("DE", "length", "mass")
     drawn = [cell for cell in assessment.success_by_parameters("DE", "length", "mass") if cell.episodes]
     assert len(axes.patches) == len(drawn)
@@ -202,9 +202,9 @@ def test_pictures_are_drawn_where_matplotlib_is(
         assessment.plot_heatmap("DD", "length", "mass")
 
 
-def test_an_assessment_is_what_its_folder_holds_wherever_it_is(assessment: perturb.Assessment, tmp_path: Path) -> None:
+def test_a_saved_assessment_can_be_loaded_from_another_place(assessment: perturb.Assessment, tmp_path: Path) -> None:
     assessment.save(tmp_path / "one")
-    assert ">one<" in assessment.to_html(), "reports say where it is"
+    assert ">one<" in assessment.to_html(), "reports name the folder"
     shutil.move(tmp_path / "one", tmp_path / "two")
     loaded = perturb.Assessment.load(tmp_path / "two")
     same_episodes(loaded, assessment)

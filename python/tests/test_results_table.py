@@ -27,7 +27,7 @@ def test_the_published_table_has_every_study_with_its_plan() -> None:
     assert failed.episodes.isna().all()
 
 
-def test_another_file_is_no_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_are_not_a_results_table_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pandas")
     (tmp_path / "other.parquet").write_text("text")
     with pytest.raises(perturb.InvalidArgumentError, match="is not a results table: it is not a Parquet file"):

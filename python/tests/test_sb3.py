@@ -1,4 +1,4 @@
-"""Tests of `perturb.sb3` with stable-baselines3: its models train on the VecEnv without wrappers, and can be evaluated.
+"""Models of stable-baselines3 train on the VecEnv of `perturb.sb3` without wrappers, and `perturb.evaluate` tests them.
 
 The tests are skipped if stable-baselines3 or torch is not installed. `make python-acceptance` installs them.
 """
@@ -46,7 +46,7 @@ def test_ppo_trains_without_wrapper_or_warning(server: str) -> None:
     assert np.mean(returns) > 100
 
 
-def test_a_step_has_what_stable_baselines3_expects(server: str) -> None:
+def test_a_step_returns_what_stable_baselines3_expects(server: str) -> None:
     envs = make_vec_env("CartPole", 4, version="R", server=server, receipts=True)
     plain = perturb.PerturbVectorEnv("CartPole", 4, version="R", server=server, autoreset_mode="SameStep")
     envs.seed(7)
@@ -60,7 +60,7 @@ def test_a_step_has_what_stable_baselines3_expects(server: str) -> None:
     truncations = 0
     for step in range(500):
         actions = rng.integers(2, size=4) if step < 250 else (observations[:, 2] + observations[:, 3] > 0).astype(int)
-        observations, rewards, dones, told = envs.step(actions)
+        observations, rewards, dones, slot_infos = envs.step(actions)
         expected, expected_rewards, terminated, truncated, infos = plain.step(actions)
         np.testing.assert_array_equal(observations, expected)
         np.testing.assert_array_equal(rewards, expected_rewards)
@@ -69,10 +69,10 @@ def test_a_step_has_what_stable_baselines3_expects(server: str) -> None:
         returns, lengths = returns + rewards, lengths + 1
         for slot in range(4):
             if not dones[slot]:
-                assert told[slot] == {}
+                assert slot_infos[slot] == {}
                 continue
             ends += 1
-            info = told[slot]
+            info = slot_infos[slot]
             np.testing.assert_array_equal(info["terminal_observation"], infos["final_obs"][slot])
             assert info["TimeLimit.truncated"] == (truncated[slot] and not terminated[slot])
             truncations += info["TimeLimit.truncated"]
@@ -87,7 +87,7 @@ def test_a_step_has_what_stable_baselines3_expects(server: str) -> None:
     plain.close()
 
 
-def test_reward_terms_come_on_request(server: str) -> None:
+def test_infos_have_reward_terms_on_request(server: str) -> None:
     envs = make_vec_env("Pendulum", 2, server=server, reward_terms=True, seed=1)
     envs.reset()
     _, rewards, _, infos = envs.step(np.zeros((2, 1), np.float32))
@@ -96,7 +96,7 @@ def test_reward_terms_come_on_request(server: str) -> None:
     envs.close()
 
 
-def test_seeds_and_options_are_for_one_reset(server: str) -> None:
+def test_seeds_and_options_are_passed_to_the_next_reset(server: str) -> None:
     envs = make_vec_env("CartPole", 3, version="R", server=server, receipts=True, seed=5)
     first = envs.reset()
     second = envs.reset()
@@ -117,7 +117,7 @@ def test_seeds_and_options_are_for_one_reset(server: str) -> None:
     envs.close()
 
 
-def test_attributes_and_methods_are_those_of_each_environment(server: str) -> None:
+def test_get_attr_and_env_method_select_environments_by_index(server: str) -> None:
     envs = make_vec_env("CartPole", 3, server=server, seed=1)
     assert isinstance(envs, PerturbVecEnv)
     envs.reset()
@@ -142,7 +142,7 @@ def test_attributes_and_methods_are_those_of_each_environment(server: str) -> No
     envs.close()
 
 
-def test_settings_that_would_break_it_are_refused(server: str) -> None:
+def test_settings_that_stable_baselines3_needs_cannot_be_changed(server: str) -> None:
     for settings in ({"autoreset_mode": "NextStep"}, {"copy": False}):
         given: dict[str, Any] = {**settings, "server": server}
         with pytest.raises(perturb.InvalidArgumentError, match=f"{next(iter(settings))}= cannot be set here"):
@@ -151,21 +151,21 @@ def test_settings_that_would_break_it_are_refused(server: str) -> None:
         make_vec_env("CartPole", server=server, version="x")
 
 
-def test_stable_baselines3s_own_evaluation_takes_it(server: str) -> None:
+def test_evaluate_policy_of_stable_baselines3_accepts_the_environments(server: str) -> None:
     from stable_baselines3.common.evaluation import evaluate_policy
 
     model = trained(server, 1024)
     envs = make_vec_env("CartPole", 4, server=server, seed=2)
     returns, lengths = evaluate_policy(model, envs, n_eval_episodes=8, return_episode_rewards=True)
-    assert returns == [float(length) for length in lengths], "a step of CartPole pays 1"
+    assert returns == [float(length) for length in lengths], "the reward of each step of CartPole is 1"
     envs.close()
 
 
-def test_saved_model_is_evaluated_to_same_bytes(tmp_path: Path, server: str) -> None:
+def test_evaluating_a_saved_model_gives_the_same_bytes(tmp_path: Path, server: str) -> None:
     models = {"D": trained(server, 4096), "R": trained(server, 4096, "R")}
     before = torch.rand(1), torch.get_rng_state()
     first = perturb.evaluate(models, "CartPole", episodes=200, seed=3, server=server)
-    assert torch.equal(torch.get_rng_state(), before[1]), "the caller's random numbers go on"
+    assert torch.equal(torch.get_rng_state(), before[1]), "evaluations do not change torch's random state"
     for name, model in models.items():
         model.save(tmp_path / name)
     loaded = {name: stable_baselines3.PPO.load(tmp_path / name, device="cpu") for name in models}
@@ -181,13 +181,13 @@ def test_saved_model_is_evaluated_to_same_bytes(tmp_path: Path, server: str) -> 
     assert mode.deterministic, "as in stable-baselines3's own evaluate_policy"
     assert "actions are the mode" in str(first)
     sampled = perturb.evaluate(models["D"], "CartPole", episodes=200, seed=3, deterministic=False, server=server)
-    assert mode.mean_return > sampled["D"].mean_return, "what PPO takes for best is better than what it tries"
+    assert mode.mean_return > sampled["D"].mean_return, "the most probable actions are better than sampled ones"
     assert sampled["D"].policy.startswith("PPO ")
     assert "actions are sampled" in str(sampled)
     assert perturb.Assessment.load(tmp_path / "first")["DD"].deterministic
 
 
-def test_a_models_vec_normalize_is_applied_and_left_alone(server: str) -> None:
+def test_evaluation_applies_vec_normalize_and_does_not_change_it(server: str) -> None:
     from stable_baselines3.common.vec_env import VecNormalize
 
     envs = VecNormalize(make_vec_env("CartPole", 8, server=server, seed=1))
@@ -200,7 +200,7 @@ def test_a_models_vec_normalize_is_applied_and_left_alone(server: str) -> None:
     envs.obs_rms.mean[:] += 1
     other = perturb.evaluate(model, "CartPole", versions=("D",), episodes=100, server=server)
     assert other["D"].mean_return != own["D"].mean_return
-    assert other["D"].policy != own["D"].policy, "it acts otherwise"
+    assert other["D"].policy != own["D"].policy, "the name of a policy has a hash of its normaliser"
     with pytest.raises(perturb.PolicyError, match="expected stable-baselines3's VecNormalize"):
         perturb.evaluate(model, "CartPole", normalizer=7, server=server)
     with pytest.raises(perturb.PolicyError, match="the model's observations are"):
@@ -221,7 +221,7 @@ def off_policy(kind: str, normalised: bool, server: str, num_envs: int = 4) -> A
 
 
 @pytest.mark.parametrize("kind", ["PPO", "DQN", "SAC"])
-def test_a_model_that_lost_its_vec_normalize_is_refused(kind: str, server: str, tmp_path: Path) -> None:
+def test_a_model_loaded_without_its_vec_normalize_is_refused(kind: str, server: str, tmp_path: Path) -> None:
     from stable_baselines3.common.vec_env import VecNormalize
 
     if kind == "PPO":
@@ -250,7 +250,7 @@ def test_a_model_that_lost_its_vec_normalize_is_refused(kind: str, server: str, 
 
 
 @pytest.mark.parametrize("kind", ["PPO", "DQN", "SAC"])
-def test_a_model_without_vec_normalize_is_taken_after_loading(kind: str, server: str, tmp_path: Path) -> None:
+def test_a_loaded_model_without_vec_normalize_is_accepted(kind: str, server: str, tmp_path: Path) -> None:
     model = trained(server, 1024) if kind == "PPO" else off_policy(kind, False, server)
     name = "Pendulum" if kind == "SAC" else "CartPole"
     model.save(tmp_path / "model")
@@ -259,7 +259,7 @@ def test_a_model_without_vec_normalize_is_taken_after_loading(kind: str, server:
     assert perturb.evaluate(loaded, name, **settings).results == perturb.evaluate(model, name, **settings).results
 
 
-def test_model_without_evidence_of_vec_normalize_is_refused(server: str, tmp_path: Path) -> None:
+def test_model_is_refused_if_use_of_vec_normalize_is_unknown(server: str, tmp_path: Path) -> None:
     off_policy("SAC", False, server, 1).save(tmp_path / "model")
     loaded = stable_baselines3.SAC.load(tmp_path / "model", device="cpu")
     settings: dict[str, Any] = {"versions": ("D",), "episodes": 5, "server": server}
@@ -302,7 +302,7 @@ def test_parameters_change_while_a_model_learns(server: str) -> None:
     envs.close()
 
 
-def test_environments_methods_change_parameters_of_some(server: str) -> None:
+def test_env_method_changes_parameters_of_selected_environments(server: str) -> None:
     envs = make_vec_env("CartPole", 3, version="R", server=server, receipts=True, seed=1)
     envs.reset()
     assert envs.env_method("set_parameters", {"length": 0.7}, indices=[0, 2]) == [None, None]
@@ -318,7 +318,7 @@ def test_environments_methods_change_parameters_of_some(server: str) -> None:
     envs.close()
 
 
-def test_monitor_finds_what_was_achieved_at_each_end(server: str) -> None:
+def test_monitor_finds_achieved_at_the_end_of_an_episode(server: str) -> None:
     from stable_baselines3.common.monitor import Monitor
 
     env = Monitor(perturb.PerturbEnv("MountainCar", server=server), info_keywords=("achieved", "is_success"))
@@ -330,7 +330,7 @@ def test_monitor_finds_what_was_achieved_at_each_end(server: str) -> None:
     assert np.isnan(info["episode"]["achieved"])
 
 
-def test_a_recurrent_model_remembers(server: str) -> None:
+def test_a_recurrent_model_keeps_its_memory_in_evaluations(server: str) -> None:
     contrib = pytest.importorskip("sb3_contrib")
     envs = make_vec_env("CartPole", 4, server=server, seed=1)
     model = contrib.RecurrentPPO("MlpLstmPolicy", envs, n_steps=64, seed=1, device="cpu").learn(512)
@@ -357,7 +357,7 @@ def test_a_recurrent_model_remembers(server: str) -> None:
     assert (forgets.columns()["length"] != one.columns()["length"]).any()
 
 
-def test_a_torch_module_acts(server: str) -> None:
+def test_a_torch_module_is_accepted_as_a_policy(server: str) -> None:
     torch.manual_seed(1)
     module = torch.nn.Sequential(torch.nn.Linear(4, 8), torch.nn.Dropout(), torch.nn.Tanh(), torch.nn.Linear(8, 2))
 
@@ -367,7 +367,7 @@ def test_a_torch_module_acts(server: str) -> None:
             return module(torch.from_numpy(observations)).argmax(1).numpy()
 
     one = perturb.evaluate(module, "CartPole", episodes=50, server=server)
-    assert module.training, "it is left as it was"
+    assert module.training, "evaluations restore the module's training mode"
     two = perturb.evaluate(by_hand, "CartPole", episodes=50, server=server)
     np.testing.assert_array_equal(one.columns()["length"], two.columns()["length"])
     assert one["D"].policy.startswith("Sequential ")
@@ -376,7 +376,7 @@ def test_a_torch_module_acts(server: str) -> None:
     assert perturb.evaluate(torch.nn.Linear(3, 1), "Pendulum", episodes=5, server=server)["D"].episodes == 5
 
 
-def test_an_agent_trains_and_is_tested_on_a_tasks_folder() -> None:
+def test_a_model_is_trained_and_tested_on_a_task_folder() -> None:
     arm = ROOT / "examples/tasks/my_arm"
     envs = make_vec_env(task=arm, num_envs=4, version="R", seed=1)
     model = stable_baselines3.PPO("MlpPolicy", envs, n_steps=64, seed=1, device="cpu").learn(1024)

@@ -34,7 +34,7 @@ architectures = ["ff"]
 """
 
 
-def test_sets_are_those_of_experiment_files(tmp_path: Path) -> None:
+def test_sets_of_experiment_files_equal_sets_made_in_python(tmp_path: Path) -> None:
     (tmp_path / "measured.csv").write_text("length,mass\n0.3,0.1\n0.5,0.2\n")
     (tmp_path / "plan.toml").write_text(TABLES)
     sets = perturb.sets.read(tmp_path / "plan.toml")
@@ -52,7 +52,7 @@ def test_sets_are_those_of_experiment_files(tmp_path: Path) -> None:
     assert perturb.sets.grid("one", {"length": 0.5}).contexts == ({"length": 0.5},)
 
 
-def test_a_policy_is_tested_on_a_grid_as_by_the_program(tmp_path: Path, server: str) -> None:
+def test_python_and_the_program_record_the_same_episodes_on_a_grid(tmp_path: Path, server: str) -> None:
     own = ["--parameters", "length=0.8..1.2/3", "mass=1"]
     evaluated(PENDULUM, tmp_path / "records", server, "--episodes", "20", *own)
     points = perturb.sets.grid("parameters", {"length": "0.8..1.2/3", "mass": 1})
@@ -60,7 +60,7 @@ def test_a_policy_is_tested_on_a_grid_as_by_the_program(tmp_path: Path, server: 
         perturb.load_policy(PENDULUM), "Pendulum", versions=[points], episodes=20, server=server
     )
     assert saved(assessment, tmp_path / "saved") == (tmp_path / "records").read_bytes()
-    assert assessment.results[0].episodes == 21, "equally many in each of three contexts"
+    assert assessment.results[0].episodes == 21, "rounded up to a multiple of the three contexts"
 
 
 def test_sampled_contexts_are_prefixes_of_larger_samples() -> None:
@@ -111,12 +111,12 @@ def test_sampled_contexts_are_prefixes_of_larger_samples() -> None:
         (lambda: perturb.sets.read("/nowhere.toml"), "nowhere"),
     ],
 )
-def test_what_is_no_set_is_refused(make: Callable[[], Any], words: str) -> None:
+def test_invalid_sets_are_refused(make: Callable[[], Any], words: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match=words):
         make()
 
 
-def test_names_are_spelled_as_one_likes() -> None:
+def test_several_spellings_of_names_are_accepted() -> None:
     expected = perturb.sets.sampled("a", "CartPole", 3, version="R")
     assert perturb.sets.sampled("a", "cart-pole", 3, version="r") == expected  # type: ignore[arg-type]
     assert perturb.sets.sampled("a", identifier("CartPole"), 3) == expected
@@ -137,7 +137,7 @@ def test_each_environment_keeps_its_context(server: str) -> None:
     expected = [0.3, 0.6, 0.9, 0.3, 0.6, 0.9, 0.3]
     assert lengths(infos) == expected
     masses = infos["parameters"]["mass"].tolist()
-    assert len(set(masses)) == 7, "the others are R's"
+    assert len(set(masses)) == 7, "the contexts do not contain the mass, so it is drawn from R"
     begun = np.zeros(7, int)
     for _ in range(200):
         *_, infos = envs.step(np.zeros(7, np.int64))
@@ -153,7 +153,7 @@ def test_each_environment_keeps_its_context(server: str) -> None:
     envs.close()
 
 
-def test_a_context_gives_the_bytes_that_its_parameters_give(server: str) -> None:
+def test_a_context_and_the_same_parameters_give_equal_episodes(server: str) -> None:
     batch = perturb.PerturbVectorEnv("CartPole", 3, contexts=LENGTHS, autoreset_mode="SameStep", server=server)
     for seeds in (5, None):
         rows, _ = batch.reset(seed=seeds)
@@ -170,7 +170,7 @@ def test_a_context_gives_the_bytes_that_its_parameters_give(server: str) -> None
     single.close()
 
 
-def test_a_new_session_has_the_contexts_again(start_server: Any) -> None:
+def test_a_new_session_keeps_the_contexts(start_server: Any) -> None:
     first = start_server()
     batch = perturb.PerturbVectorEnv("CartPole", 3, contexts=LENGTHS, server=first.address)
     _, infos = batch.reset(seed=1)
@@ -188,11 +188,11 @@ def test_a_new_session_has_the_contexts_again(start_server: Any) -> None:
         batch.step(np.zeros(3, np.int64))
     start_server(listen=first.address)
     _, again = batch.reset(seed=1)
-    assert lengths(again) == [0.5] * 3, "what a reset gave to all is kept"
+    assert lengths(again) == [0.5] * 3, "the parameters of the reset replace the contexts"
     batch.close()
 
 
-def test_sets_with_contexts_can_be_trained_on(server: str) -> None:
+def test_environments_accept_a_set_as_contexts(server: str) -> None:
     grid = perturb.sets.grid("corners", {"length": [0.3, 0.9]}, base="R")
     batch = perturb.PerturbVectorEnv("CartPole", 4, contexts=grid, version="R", server=server)
     _, infos = batch.reset(seed=1)
@@ -214,7 +214,7 @@ def test_sets_with_contexts_can_be_trained_on(server: str) -> None:
             perturb.PerturbVectorEnv("CartPole", **arguments)
 
 
-def test_stable_baselines3_trains_on_them(server: str) -> None:
+def test_environments_for_stable_baselines3_accept_contexts(server: str) -> None:
     pytest.importorskip("stable_baselines3")
     import perturb.sb3
 

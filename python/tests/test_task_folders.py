@@ -29,16 +29,16 @@ ARM = ROOT / "examples/tasks/reaching_arm"
 
 @pytest.fixture
 def arm(tmp_path: Path) -> Path:
-    """Return a copy of the folder of the task `arm`, which the test may change."""
+    """Return a copy of the task folder of ReachingArm, which the test may change."""
     return Path(shutil.copytree(ARM, tmp_path / "arm"))
 
 
 def steps(env: Any, count: int = 5) -> list[bytes]:
     """Step with a fixed action, and return the bytes of the observations."""
     observation, _ = env.reset(seed=3)
-    told = [observation.tobytes()]
+    observed = [observation.tobytes()]
     action = np.full(env.action_space.shape, 0.5, np.float32)
-    return told + [env.step(action)[0].tobytes() for _ in range(count)]
+    return observed + [env.step(action)[0].tobytes() for _ in range(count)]
 
 
 def test_an_environment_is_made_by_id_by_name_or_from_the_folder_alone(tmp_path: Path) -> None:
@@ -58,7 +58,7 @@ def test_an_environment_is_made_by_id_by_name_or_from_the_folder_alone(tmp_path:
     assert not local_server._shared, "each server ends with its last environment"
 
 
-def test_a_batch_and_its_copies_are_of_the_folder(arm: Path) -> None:
+def test_copies_of_a_batch_have_the_task_of_its_folder(arm: Path) -> None:
     envs = gymnasium.make_vec("perturb/Task-v0", num_envs=3, task=arm)
     assert isinstance(envs, perturb.PerturbVectorEnv)
     expected = steps(envs)
@@ -81,7 +81,7 @@ def test_environments_and_sets_know_a_folders_parameters() -> None:
     assert len(perturb.sets.sampled("some", "reaching-arm", 3, task=ARM).contexts or ()) == 3
 
 
-def test_an_assessment_of_a_folder_is_replayed(arm: Path) -> None:
+def test_an_audit_finds_changes_of_a_task_folder(arm: Path) -> None:
     def still(observations: Any) -> Any:
         return np.zeros((len(observations), 2), np.float32)
 
@@ -144,14 +144,14 @@ def test_a_wrong_task_is_refused_with_a_remedy(settings: dict[str, Any], words: 
             make(**{"task": ARM, **settings})
 
 
-def test_a_wrong_folder_is_refused_with_the_servers_sentence(arm: Path) -> None:
+def test_a_wrong_folder_is_refused_with_the_servers_message(arm: Path) -> None:
     text = (arm / "task.toml").read_text()
     (arm / "task.toml").write_text(text.replace("step_limit", "steps_limit", 1))
     with pytest.raises(perturb.InvalidArgumentError, match=r"task.toml, line 6: unknown key \"steps_limit\""):
         gymnasium.make("perturb/Task-v0", task=arm)
 
 
-def test_a_running_servers_tasks_need_no_folder(start_server: Callable[..., Server]) -> None:
+def test_the_tasks_of_a_running_server_need_no_folder(start_server: Callable[..., Server]) -> None:
     running = start_server("--task", str(ARM))
     env = perturb.PerturbEnv("reaching-arm", server=running.address)
     local = perturb.PerturbEnv(task=ARM)
@@ -162,7 +162,7 @@ def test_a_running_servers_tasks_need_no_folder(start_server: Callable[..., Serv
         perturb.PerturbEnv("Walker2dV5", server=running.address)
 
 
-def test_the_tutorials_arm_is_the_example_with_its_policies() -> None:
+def test_the_example_equals_the_arm_of_the_tutorial_and_has_policies() -> None:
     """The example's files equal those in the tutorial, so the tutorial's result tables also hold for the example."""
     example = ROOT / "examples/tasks/my_arm"
     tutorial = (ROOT / "docs/tutorials/your-robot.md").read_text()

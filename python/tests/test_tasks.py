@@ -1,4 +1,4 @@
-"""Task folders can be written for tasks of Gymnasium and dm_control."""
+"""`perturb.tasks` writes task folders for tasks of Gymnasium and dm_control."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def test_a_folder_of_dm_control_has_model_and_includes(
         from_dm_control("walker-walk", tmp_path)
 
 
-def test_an_unknown_id_is_refused_with_those_that_there_are(tmp_path: Path) -> None:
+def test_the_refusal_of_an_unknown_id_lists_the_known_ids(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="Walker2d-v5"):
         from_gymnasium("Walker2d-v4", tmp_path)
 

@@ -1,4 +1,4 @@
-"""Trainings from Python, by the program `perturb`."""
+"""`perturb.train` trains policies with the program `perturb`."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_training_gives_policy_log_and_result(tmp_path: Path, server: str) -> 
     assert again.policy.id == trained.policy.id, "the same seed, the same weights"
 
 
-def test_what_the_program_refuses_is_refused_in_its_words(tmp_path: Path, server: str) -> None:
+def test_errors_contain_the_reasons_for_which_the_program_refuses(tmp_path: Path, server: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="Cart"):
         perturb.train("Cart", episodes=1, out=tmp_path / "run", server=server)
     with pytest.raises(perturb.InvalidArgumentError, match="learning_rat"):
@@ -53,13 +53,13 @@ def test_what_the_program_refuses_is_refused_in_its_words(tmp_path: Path, server
         perturb.train("CartPole", version="X", out=tmp_path / "run")  # type: ignore[arg-type]
 
 
-def test_without_the_program_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_error_says_how_to_get_a_missing_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(training.VARIABLE, "/nowhere/perturb")
     with pytest.raises(perturb.ServerStartError, match="make wheel"):
         perturb.train("CartPole", episodes=1)
 
 
-def test_example_policies_run_and_break_elsewhere(server: str) -> None:
+def test_example_policies_succeed_on_d_and_the_one_of_d_often_fails_on_r(server: str) -> None:
     assessment = perturb.evaluate(perturb.example_policies(), "Hopper", episodes=100, seed=1, server=server)
     rate = {result.scenario: result.success_percent for result in assessment.results}
     assert min(rate["DD"], rate["RD"]) > 85, rate

@@ -1,4 +1,4 @@
-"""A batch in one of Gymnasium's vector wrappers returns the values of an unwrapped batch, changed as expected."""
+"""Gymnasium's vector wrappers work: a wrapped batch returns the values of an unwrapped batch, changed as expected."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def make(mode: AutoresetMode, server: str) -> gymnasium.vector.VectorEnv[Any, An
 
 @pytest.mark.parametrize("mode", AutoresetMode)
 @pytest.mark.parametrize("name", WRAPPERS)
-def test_wrappers_give_equal_values(name: str, mode: AutoresetMode, server: str) -> None:
+def test_wrapped_batches_return_the_expected_values(name: str, mode: AutoresetMode, server: str) -> None:
     wrap, change = WRAPPERS[name]
     plain = make(mode, server)
     try:
@@ -63,7 +63,7 @@ def test_wrappers_give_equal_values(name: str, mode: AutoresetMode, server: str)
     except ValueError as error:
         if "autoreset_mode" not in str(error):
             raise
-        pytest.skip("Gymnasium's wrapper is not for this mode")
+        pytest.skip("Gymnasium's wrapper does not support this autoreset mode")
     observations, got = plain.reset(seed=5)[0], wrapped.reset(seed=5)[0]
     kept = []
     for step in range(410):  # two episodes of 200 steps, and the start of a third

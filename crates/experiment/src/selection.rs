@@ -221,9 +221,9 @@ impl<'a> MethodResults<'a> {
         Summary::from_values(&self.metric(metric).into_values().collect::<Vec<_>>())
     }
 
-    /// Summarizes a number of a test, for example its mean return, over runs. The policies were trained on `trained_on`
-    /// and tested on the set or version `tested_on`. Tied configurations of a run are averaged. Returns `None` if no
-    /// run has the test.
+    /// Summarizes one quantity of a test's result, for example its mean return, over runs. `figure` reads the quantity
+    /// from the result. The policies were trained on `trained_on` and tested on the set or version `tested_on`. Tied
+    /// configurations of a run are averaged. Returns `None` if no run has the test.
     pub fn test(&self, trained_on: TrainedOn<'_>, tested_on: &str, figure: fn(&TestResult) -> f64) -> Option<Summary> {
         let of_run = |run: &SelectedRun<'_>| run.mean_over_ties(trained_on, tested_on, figure);
         Summary::from_values(&self.runs.values().filter_map(of_run).collect::<Vec<_>>())
@@ -243,8 +243,8 @@ impl<'a> SelectedRun<'a> {
         self.trained_on(trained_on).into_iter().chain(tied).collect()
     }
 
-    /// Returns a number of a test, averaged over tied configurations. Returns `None` if one of the configurations has
-    /// no test on `tested_on`.
+    /// Returns one quantity of a test's result, averaged over tied configurations. Returns `None` if one of the
+    /// configurations has no test on `tested_on`.
     fn mean_over_ties(
         &self,
         trained_on: TrainedOn<'_>,

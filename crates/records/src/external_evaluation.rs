@@ -117,7 +117,8 @@ pub enum ExternalEvaluationError {
     /// `assessment.json` has a format version that this program cannot read.
     #[error("{} has format {got}; this program reads {FORMAT_VERSION}", path.display())]
     Format { path: PathBuf, got: u64 },
-    /// There are no policies, the policies are of different environments, or two have the same training distribution.
+    /// There are no policies, the policies are of different environments, or two have the same training distribution
+    /// or an unknown one.
     #[error("policies of an assessment have one environment and different training distributions, but {got}")]
     Mixed {
         /// The last clause of the message. It describes the policies that were given, e.g. "they are of CartPole and

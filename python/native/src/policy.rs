@@ -21,8 +21,8 @@ pub struct PythonPolicy {
 
 #[pymethods]
 impl PythonPolicy {
-    /// Loads a policy from a policy file, from the folder of a checkpoint, or from the folder above `checkpoint`. Also
-    /// accepts the id of an experiment's cell; see [`Checkpoint::load`].
+    /// Loads a policy from a policy file, from the folder of a checkpoint, or from the folder of a training, which has
+    /// the folder `checkpoint`. Also accepts the id of an experiment's cell; see [`Checkpoint::load`].
     #[staticmethod]
     fn load(path: PathBuf) -> PyResult<Self> {
         let checkpoint = Checkpoint::load(&path).map_err(|error| refused(&error))?;

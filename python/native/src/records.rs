@@ -156,8 +156,8 @@ impl PythonRecords {
         })
     }
 
-    /// Returns a context's number for each episode `[n]` of the test on a set. Contexts are numbered from 0. If the set
-    /// has a list of contexts, these are the contexts. Otherwise each context is a region of the parameter space.
+    /// Returns the number of each episode's context, `[n]`, for the test on a set. Contexts are numbered from 0. If the
+    /// set is a list or a grid, its contexts are used. Otherwise each context is a region of the parameter space.
     fn parts(&self, name: &str) -> Vec<usize> {
         Outcomes::new(&self.0, name).parts()
     }

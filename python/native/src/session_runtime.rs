@@ -66,7 +66,8 @@ struct Reactor {
     owner: u32,
 }
 
-/// All runtimes of this process that sessions use.
+/// The runtimes that further sessions may share. After a fork, the list also has runtimes of the parent process, which
+/// [`Reactor::find`] ignores.
 static REACTORS: Mutex<Vec<Weak<Reactor>>> = Mutex::new(Vec::new());
 
 impl Reactor {

@@ -14,12 +14,12 @@ use pyo3::prelude::*;
 use crate::failure::{INVALID, failure};
 use crate::requests::IntervalsByName;
 
-/// A test set as a Python tuple: its name, its version, the intervals that replace the version's, and the contexts of a
-/// grid or a list.
+/// A test set as a Python tuple: its name, its version, the intervals that replace those of the version, and the
+/// contexts of a grid or a list.
 pub type Set = (String, String, IntervalsByName, Option<Vec<BTreeMap<String, f64>>>);
 
-/// Makes a test set from the values of each parameter in the syntax of experiment files. If they are intervals,
-/// the set's parameters are drawn. If they are points, the set is a grid.
+/// Makes a test set from the values of each parameter in the syntax of experiment files. If a parameter has points, the
+/// set is a grid. Otherwise its parameters are drawn.
 #[pyfunction]
 pub fn make_set(name: &str, version: &str, values: Vec<(String, String)>) -> PyResult<Set> {
     let assignments = values.into_iter().map(|(parameter, values)| format!("{parameter}={values}").parse());

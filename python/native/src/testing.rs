@@ -94,8 +94,8 @@ impl PythonTests {
     }
 
     /// Records the episodes that ended in a step and that count in the test. Only the last episode of a trial counts,
-    /// and only in the first trials of each environment. Returns the number of recorded episodes, and the number that
-    /// the test needs.
+    /// and only the first trials of each environment, up to a planned number. Returns the number of recorded episodes,
+    /// and the number that the test needs.
     fn take(&mut self, events: Option<&Events>, terminated: PyReadonlyArray1<'_, bool>) -> PyResult<(u64, u64)> {
         let Some(counting) = &mut self.counting else { return Err(failure(UNUSABLE, 0, "no test has begun")) };
         if let Some(events) = events {

@@ -43,7 +43,7 @@ class NativeServer:
     def close(self) -> None: ...
 
 class Session:
-    """A stream to a server. It owns a batch of environments."""
+    """A session: one stream to a server. The session owns a batch of environments."""
 
     timeout: float
     @property
@@ -164,14 +164,15 @@ def compare_rows(
 ) -> str:
     """Compare conditions that consist of rows of a results table. Return JSON.
 
-    `sets` names the test sets to compare on. None stands for all sets that every policy was tested on. If
-    the rows are from several studies, None stands only for the versions among these sets.
+    `sets` names the test sets to compare on. None stands for all sets that every policy was tested on. If the rows are
+    from several studies, None stands only for the versions among these sets.
     """
 
 def report_page(assessments: list[Assessment], beside: list[str]) -> str:
-    """Return the report page of assessments, and of the folders `beside` with experiments and assessments, as HTML."""
+    """Return the report page, as HTML, of assessments and of the experiments and assessments in folders `beside`."""
 
-# A test set: its name, its version, the intervals that replace the version's by parameter, and its contexts or None.
+# A test set: its name, its version, the intervals that replace those of the version (by parameter), and the contexts of
+# a grid or a list, or None.
 Set: TypeAlias = tuple[str, str, dict[str, list[tuple[float, float]]], list[dict[str, float]] | None]
 
 def make_set(name: str, version: str, values: list[tuple[str, str]]) -> Set:

@@ -371,13 +371,12 @@ class Assessment:
     ) -> Audit:
         """Repeat all recorded episodes with the same policy, and compare the outcomes with the records.
 
-        Use this method for policies that only Python can load. `perturb audit` replays policies that perturb trained,
-        on any machine. A policy that samples with torch or NumPy gives equal outcomes only on the same kind of machine
-        with the same packages.
+        Use this method for policies that only Python can load. For policies that perturb trained, `perturb audit` does
+        the same on any machine. A policy that samples with torch or NumPy gives equal outcomes only on the same kind of
+        machine with the same packages.
 
         Args:
-            policy: the tested policy. If several policies were tested, a mapping from the version that each was trained
-                on to the policy.
+            policy: the tested policy. If several policies were tested, a mapping from training versions to policies.
             normalizer: as in `evaluate`.
             server: as in `evaluate`.
             task: as in `evaluate`. If its files have changed since the recorded tests, the episodes differ.

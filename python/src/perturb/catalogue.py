@@ -1,7 +1,7 @@
 """Descriptions of the built-in environments, read from the file catalogue.json.
 
-With them, an environment can be constructed without a server, for example in a process that is forked later. The build
-of the package writes the output of `perturb-server --catalogue` to catalogue.json. When a session opens, its
+With a description, an environment can be constructed without a server, for example in a process that is forked later.
+The build of the package writes the output of `perturb-server --catalogue` to catalogue.json. When a session opens, its
 environment's description is compared with the server's. A difference is an error.
 """
 
@@ -165,7 +165,7 @@ class Description:
             raise ProtocolError(f"the server describes {self.name} as {served}, this package as {self}")
 
     def require_same_model(self, served: Description) -> None:
-        """Check that the server loaded the same model file.
+        """Check that the server loaded the same files of the task folder.
 
         Raises:
             ProtocolError: if the hash of the server's model differs.
@@ -180,7 +180,7 @@ class Description:
 def _observed(disturbance: Mapping[str, Any]) -> Range:
     """Return the range of a disturbance's entry in observations.
 
-    The entry is scaled so that -1 and 1 are the lowest and the highest value that R and E draw.
+    The entry is scaled so that the lowest and the highest value that R and E draw become -1 and 1.
     """
     ends = [end for interval in (*disturbance["R"], *disturbance["E"]) for end in interval]
     least, greatest = min(ends), max(ends)

@@ -138,7 +138,7 @@ class Client:
         """Open a session and begin the first episodes. If a session is open already, return None and do nothing.
 
         `seeds[0]` is the seed of the batch. If `seeds` is empty, the generator draws the seed. An environment starts
-        with the parameters of its context, if it has one. Parameters that earlier resets set take precedence.
+        with the parameters of its context, if it has one. Parameters that were set by an earlier reset take precedence.
 
         Raises:
             OutOfOrderError: if a snapshot was restored in the last session, and that session was lost. The parameters
@@ -171,7 +171,7 @@ class Client:
             if self._task is not None:
                 self.description.require_same_model(served)
             begun = OpenedSession(opened, opened.observations, opened.events)
-            if any(self._own_parameters):  # some environments have parameters of their own, which resets set
+            if any(self._own_parameters):  # `session.open` sets only the parameters that all environments share
                 begun = self._set_own_parameters(session, opened, seed)
         except BaseException:
             session.close()

@@ -83,11 +83,11 @@ def compare(
 
     Args:
         conditions: the policies of each condition, by a name of your choice: one policy, a list, or a mapping by keys
-            such as training seeds. In a list, the keys are the policies' training seeds if `load_policy` returned all
-            of them and their seeds differ. Otherwise the keys are the positions in the list. A policy is one that
-            `evaluate` accepts, an `Assessment`, or the path of a saved assessment or of a checkpoint. Instead of
-            policies, each condition may have rows of `read_results`, such as `dict(list(rows.groupby("algorithm")))`.
-            Rows have numbers of successes but no episodes, so only success rates have an interval over episodes.
+            such as training seeds. If perturb trained all policies of a list and their training seeds differ, the keys
+            are these seeds. Otherwise the keys are the positions in the list, from 1. A policy is one that `evaluate`
+            accepts, an `Assessment`, or the path of a saved assessment or of a checkpoint. Instead of policies, each
+            condition may have rows of `read_results`, such as `dict(list(rows.groupby("algorithm")))`. Rows have
+            numbers of successes but no episodes, so only success rates have an interval over episodes.
         environment: as in `evaluate`. Leave it out if all policies are assessments or rows.
         versions: as in `evaluate`. For assessments and rows, the tests to compare, by default all tests that they have
             in common. For rows, a set may be given by its name. For rows of several studies, the default includes only

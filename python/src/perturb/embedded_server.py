@@ -43,7 +43,7 @@ class EmbeddedServer:
         self.native.close()
 
     def exit_status(self) -> int | None:
-        """Return None, because the server runs as long as this process."""
+        """Return None, because the server does not end before `end` is called."""
         return None
 
 

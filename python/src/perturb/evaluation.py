@@ -92,8 +92,8 @@ def evaluate(
             sampling. True by default, as in stable-baselines3's `evaluate_policy`. Policies of `load_policy` sample.
         normalizer: for a stable-baselines3 model, its VecNormalize, which is only read, or the path of a saved one.
             False for none. By default the VecNormalize of the model's environment. A model that was loaded without its
-            environment has no VecNormalize, and is refused if it was trained with one. If `policy` is a mapping, pass
-            a mapping with the same keys.
+            environment has no VecNormalize, and is refused if it was, or may have been, trained with one. If `policy`
+            is a mapping, pass a mapping with the same keys, or False.
         name: a name for the policy in records and reports. By default records name a function by its own name, and a
             model by its class and a checksum of its weights. Reports leave the checksum out. Do not pass `name` for a
             policy of `load_policy`: records have its id, and reports its method, such as `ppo ff`.
@@ -151,7 +151,7 @@ def plain_sets(
     own = parameters is not None or contexts is not None
     named: Sequence[Any] = (() if own else ("D", "R", "E")) if versions is None else versions
     if isinstance(named, str) or not isinstance(named, Sequence):
-        raise InvalidArgumentError(f"versions={versions!r}; expected several, such as ('D', 'R', 'E')")
+        raise InvalidArgumentError(f"versions={versions!r}; expected a list, such as ['D', 'R', 'E']")
     chosen = [one for one in named if isinstance(one, Set)]
     plain = [requests.version(one) for one in named if not isinstance(one, Set)]
     sets: list[_native.Set] = [(version, version, {}, None) for version in requests.VERSIONS if version in plain]

@@ -43,7 +43,8 @@ END_LIMIT = 5.0
 def find_program() -> Path:
     """Find the program perturb-server.
 
-    The environment variable PERTURB_SERVER is tried first, then the program inside the package, then PATH.
+    If the environment variable PERTURB_SERVER is set, it names the program. Otherwise the program is the one inside the
+    package, or else the first on PATH.
 
     Raises:
         ServerStartError: if there is no such program. The message says how to install it.

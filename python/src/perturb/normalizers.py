@@ -74,8 +74,8 @@ def _require_untouched(model: Any) -> None:
 
     stable-baselines3 stores the last observations of a model in `_last_obs`. In `_last_original_obs` it stores the last
     observations before normalisation. On-policy algorithms set `_last_original_obs` only under a VecNormalize.
-    Off-policy algorithms always set it. In them, `_last_obs` is a scaled and shifted copy of `_last_original_obs` under
-    a VecNormalize. Without a VecNormalize, `_last_obs` has the observations of the step after `_last_original_obs`.
+    Off-policy algorithms always set it. Under a VecNormalize, their `_last_obs` is a scaled and shifted copy of
+    `_last_original_obs`. Without a VecNormalize, it has the observations of the step after `_last_original_obs`.
     """
     original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
     if original is None:

@@ -1,6 +1,6 @@
 """Adapters with which `evaluate` runs policies of any kind: perturb's, functions, and models of other libraries.
 
-This module does not import stable-baselines3 or torch itself. If a policy is an object of one of their classes, the
+Importing this module does not import stable-baselines3 or torch. If a policy is an object of one of their classes, the
 caller has already imported the library.
 """
 
@@ -102,7 +102,7 @@ def prepare(
         named = name or f"function {called}"
         return PolicyUnderTest(named, lambda _num_envs, _seed: _Function(policy, remembers), named)
     raise PolicyError(
-        f"policy is {policy!r}; expected one of load_policy(), a function of a batch of observations, a "
+        f"policy is {policy!r}; expected a policy of load_policy(), a function of a batch of observations, a "
         "stable-baselines3 model, a torch module, or a mapping of such by the versions that they were trained on"
     )
 
@@ -127,10 +127,11 @@ def _has_memory(function: Callable[..., Any]) -> bool:
     needed = [it for it in parameters if it.default is it.empty and it.kind in positional]
     keywords = [it for it in parameters if it.default is it.empty and it.kind is inspect.Parameter.KEYWORD_ONLY]
     if len(needed) not in (0, 1, 3) or keywords or (not needed and not list(parameters)):
+        names = ", ".join(it.name for it in [*needed, *keywords])
         raise PolicyError(
-            f"the function {getattr(function, '__qualname__', function)} must be given "
-            f"{', '.join(it.name for it in [*needed, *keywords]) or 'nothing'}; expected actions = f(observations), or "
-            "with memory actions, memory = f(observations, memory, starts)"
+            f"the function {getattr(function, '__qualname__', function)} requires "
+            f"{f'the arguments {names}' if names else 'no arguments'}; expected actions = f(observations), or with "
+            "memory actions, memory = f(observations, memory, starts)"
         )
     return len(needed) == 3
 

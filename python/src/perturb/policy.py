@@ -26,7 +26,7 @@ def load_policy(path: str | os.PathLike[str]) -> Policy:
     """Load a policy that perturb's learner trained.
 
     `path` is the `--out` folder of the training, its checkpoint folder, or a policy file (`.safetensors`). It may also
-    be the id of an experiment's cell. Cells are searched in the folder that the environment variable PERTURB_RESULTS
+    be the id of an experiment's cell. Cells are looked up in the folder that the environment variable PERTURB_RESULTS
     names, by default `results`.
 
     Raises:

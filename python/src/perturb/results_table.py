@@ -13,7 +13,7 @@ from .policy import native
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-# Columns of integers. They have no value in the row of a failed cell.
+# Columns of integers that have no value in the row of a failed cell.
 COUNTS = ("revision", "after_episodes", "episodes", "successes", "timesteps")
 
 

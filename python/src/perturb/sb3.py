@@ -75,8 +75,8 @@ class PerturbVecEnv(CheckedAttributes, VecEnv):  # type: ignore[misc]  # type ch
     - `is_success`, `diverged` and `achieved`;
     - `parameters`, `receipt` and `context_id`, with `receipts=True`.
 
-    With `reward_terms=True` every info has `reward_terms`. All other infos are empty. The attribute `reset_infos` has
-    the infos of the last reset.
+    The infos of all other steps are empty. With `reward_terms=True`, the infos of all steps also have `reward_terms`.
+    The attribute `reset_infos` has the infos of the last reset.
 
     Call `env_method("set_parameters", {"length": 0.7})` to change the physics from each environment's next episode on.
     """

@@ -1,4 +1,4 @@
-"""A session: one stream to a server that owns a batch of environments. Replies come in the order of the requests.
+"""A session is one stream to a server, and owns a batch of environments. Replies come in the order of the requests.
 
 The native module implements the stream. This module starts the private server if one is needed, and converts the
 stream's failures to errors with messages. A session belongs to the process that opened it. The first reset opens it, so
@@ -49,13 +49,13 @@ if TYPE_CHECKING:
 Reply = TypeVar("Reply")
 
 # Interval of keepalive pings to a silent server, and maximum time to wait for their answer, s. The maximum is long, so
-# that environments are not lost while a machine is busy. A long maximum does not delay the notice of a server's end,
-# because the operating system then closes the server's sockets at once.
+# that environments are not lost while a machine is busy. When a server's process ends, its clients notice at once,
+# because the operating system closes the process's sockets.
 KEEPALIVE_INTERVAL, KEEPALIVE_LIMIT = 10.0, 20.0
 # Interval at which idle sessions answer the server's keepalive pings, s.
 POLL_INTERVAL = 0.25
-# A pause of this process (such as Ctrl-Z) may explain a lost connection, and error messages then say so. Minimum length
-# of such a pause, and the time after it in which error messages consider it, s.
+# Error messages name a recent pause of this process, such as Ctrl-Z, as the likely reason for a lost connection.
+# Minimum length of such a pause, and maximum time since its end, s.
 PAUSE_LIMIT, PAUSE_MEMORY = 2.0, 60.0
 # gRPC status codes with which a server ends a stream.
 DEADLINE_EXCEEDED, RESOURCE_EXHAUSTED, OUT_OF_RANGE, UNIMPLEMENTED, UNAUTHENTICATED = 4, 8, 11, 12, 16
@@ -150,8 +150,8 @@ class Session:
 
     def _end_reason(self) -> str | None:
         """Return the reason why the session has ended, or None if it has not."""
-        # `_failed` stores the reason in `_lost`. If a second Ctrl-C interrupts it, the native session has ended, but no
-        # reason is stored.
+        # `_failed` stores the reason in `_lost`. If a second Ctrl-C interrupts `_failed`, the native session has ended,
+        # but no reason is stored.
         return self._lost or ("it was interrupted, or its connection ended" if self._native.ended else None)
 
     def open(self, **request: Any) -> _native.Opened:
@@ -246,7 +246,8 @@ class Session:
         loads = self._compiles or (self._embedded and kind in ("open", "render"))
         try:
             if loads:
-                # Release this lock before `_failed` closes the session, which takes the lock of `local_server`.
+                # Release this lock before `_failed` closes the session. Closing waits for the lock of `local_server`,
+                # which another thread may hold while it starts a server.
                 with embedded_server.loading:
                     return call(*arguments, **fields)
             return call(*arguments, **fields)
@@ -329,7 +330,7 @@ class Session:
                 f"start one with `perturb-server --listen {_listen(self.address)}`, or correct server="
             )
         pause = _keepalive.longest_pause()
-        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # with this code, the server ended an idle session
+        if pause >= PAUSE_LIMIT and code != DEADLINE_EXCEEDED:  # this code means that the session was idle
             return ServerConnectionError(
                 f"{lost}: {words}. This process did not run for {pause:.0f} s (Ctrl-Z, a debugger, a suspended "
                 "computer, or code that holds Python's lock), and did not answer the server's keepalive pings "
@@ -351,19 +352,19 @@ def _listen(address: Address) -> str:
     return f"tcp://{rest}{guards}"
 
 
-# Resources of a session that must be closed: the stream, the private or embedded server, and the id of the process that
-# opened the session.
+# Everything needed to close a session: the stream, the private or embedded server (None for another server), and the id
+# of the process that opened the session.
 _Resources: TypeAlias = "tuple[_native.Session, LocalServer | EmbeddedServer | None, int]"
-# Resources of sessions that were deleted without a call of `close`. They are closed by the keepalive thread, or by the
-# next call that opens or closes a session.
+# The resources of sessions that were deleted without a call of `close`. The keepalive thread closes these sessions, or
+# the next call that opens or closes a session does.
 _unclosed: collections.deque[_Resources] = collections.deque()
 
 
 def _close_unclosed(*, wait: bool = True) -> None:
-    """Close the resources of deleted sessions.
+    """Close the sessions that were deleted without a call of `close`.
 
     Another thread may be starting a server, and then holds a lock that is needed here. If `wait` is false, leave the
-    remaining resources for a later call instead of waiting for that lock.
+    remaining sessions for a later call instead of waiting for that lock.
     """
     with contextlib.suppress(IndexError):  # another thread may have taken the last entry
         while True:
@@ -376,9 +377,9 @@ def _close_unclosed(*, wait: bool = True) -> None:
 def _close(
     native: _native.Session, local: LocalServer | EmbeddedServer | None, owner: int, *, wait: bool = True
 ) -> bool:
-    """Close a session's resources. Return False if the server could not be released; the caller must call again."""
+    """Close a session. Return False if its server could not be released; the caller must then call again later."""
     if os.getpid() != owner:
-        return True  # resources that a forked process inherited belong to its parent
+        return True  # a forked process must not close the session of its parent
     native.close()  # a second call does nothing
     return local is None or local_server.release(local, wait=wait)
 
@@ -401,7 +402,10 @@ class _KeepaliveThread:
         self._pause = (0.0, 0.0)
 
     def longest_pause(self) -> float:
-        """Return the length of the longest pause of this process that ended in the last minute, s. 0 without pauses."""
+        """Return the length of the longest pause of this process that ended in the last minute, s.
+
+        Without a pause, the result is near 0: usually a few milliseconds, or negative, but at least -`POLL_INTERVAL`.
+        """
         self._note_pause()
         length, end = self._pause
         return length if _now() - end < PAUSE_MEMORY else 0.0
@@ -420,7 +424,7 @@ class _KeepaliveThread:
                 self._thread = start_thread("perturb-keepalive", self._run)
 
     def end(self) -> None:
-        """End the thread before Python exits, because then no thread may run in the native module."""
+        """End the thread before Python exits. No thread may run in the native module while Python exits."""
         self._ended.set()
         if self._thread is not None:
             self._thread.join()
@@ -436,7 +440,7 @@ class _KeepaliveThread:
             self._last_run = _now()
             # A separate function, so that no local variable keeps a session alive during the wait.
             self._poll_sessions()
-            _close_unclosed(wait=False)  # without waiting, because pings must be answered while a server starts
+            _close_unclosed(wait=False)  # pings must be answered even while another thread starts a server
 
     def _poll_sessions(self) -> None:
         for session in self.sessions():

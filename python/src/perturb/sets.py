@@ -211,7 +211,7 @@ def read_csv(name: str, path: str | os.PathLike[str], *, base: requests.Version 
 
 
 def read(path: str | os.PathLike[str]) -> dict[str, Set]:
-    """Read the sets of an experiment file, the tables `[sets.NAME]`, by name.
+    """Read the sets of an experiment file, which are its tables `[sets.NAME]`. Return them by name.
 
     Raises:
         InvalidArgumentError: if the file is malformed or cannot be read. The message names the table and the key.
@@ -225,7 +225,7 @@ def contexts_of(
     """Return the contexts of a set, for environments whose constructor also gets `version` and `parameters`.
 
     Raises:
-        InvalidArgumentError: if the set has no contexts, if its base is not the version, or if there are parameters.
+        InvalidArgumentError: if the set has no contexts, if its base is not `version`, or if `parameters` is not None.
     """
     if chosen.contexts is None:
         raise InvalidArgumentError(
@@ -247,7 +247,8 @@ def _environment(name: str, task: str | os.PathLike[str] | None) -> Environment:
 
 def _made(name: str, base: str, texts: Mapping[str, str]) -> Set:
     if not texts:
-        raise InvalidArgumentError(f"the set {name!r} names no parameter: it is a version")
+        expected = "name at least one, or test on the version itself"
+        raise InvalidArgumentError(f"the set {name!r} names no parameter; {expected}")
     return _set(requests.parse_set(_name(name), requests.version(base, "base"), list(texts.items())))
 
 

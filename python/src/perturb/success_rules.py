@@ -30,7 +30,7 @@ class OwnRule:
 
     # The name of the quantity that is compared, such as `return`, or the name of a function.
     quantity: str
-    # Whether success means at least the threshold; otherwise at most the threshold.
+    # Whether success needs a quantity of at least the threshold. If false, it needs one of at most the threshold.
     at_least: bool
     threshold: float
     # Returns the quantity of each episode, [episodes], from the records' columns.

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from .results import Result
 
 METRICS = ("Default", "Interpolation", "Extrapolation")
-# The words in tables for how actions were chosen, by whether the policy was deterministic.
+# The words in tables that say how actions were chosen. The keys are values of `Result.deterministic`.
 ACTIONS = {True: "the mode", False: "sampled", None: ""}
 
 

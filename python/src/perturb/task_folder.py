@@ -95,8 +95,8 @@ def describe(
 ) -> Description:
     """Return the description of an environment.
 
-    With `task` it is the task in the folder. Otherwise the name is looked up among the built-in environments first, and
-    then among the environments of the server.
+    With `task`, the environment is the task in that folder. Otherwise the name is looked up among the built-in
+    environments first, and then among the environments of the server.
 
     Args:
         environment: the environment's name. It may be None with `task`.

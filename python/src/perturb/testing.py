@@ -57,15 +57,15 @@ def replay(
     if set(given) != set(keys):
         expected = "one policy" if keys == [None] else f"a mapping with the keys {', '.join(map(repr, keys))}"
         raise InvalidArgumentError(
-            f"the recorded tests are of other policies than those that are given; expected {expected}"
+            f"the given policies are not those of the recorded tests; expected {expected}"
         )
     episodes, different = 0, []
     for one in recorded:
         known, records = one.known, one.records
         acts, own_normalizer = given[one.trained_on]
         name = agent if records.policy == agent and not isinstance(acts, Policy) else None
-        # If Python judged these records, its rule may have been a function, which the records do not contain. Then the
-        # columns `success` and `achieved` are not compared.
+        # If Python judged these records, do not compare the columns `success` and `achieved`. The success rule may have
+        # been a function, which the records do not contain.
         own = success_rules.is_own(records.rule)
         settings = Settings(
             records.environment,
@@ -179,7 +179,7 @@ def policies(policy: Any, trained_on: str | None, normalizer: Any) -> list[tuple
         normalizer = dict.fromkeys(policy, False)
     normalizers = {} if normalizer is None else normalizer
     if not isinstance(normalizers, Mapping) or set(normalizers) - set(policy):
-        raise InvalidArgumentError("normalizer must be a mapping with keys of the mapping of policies")
+        raise InvalidArgumentError("normalizer must be False, or a mapping with keys of the mapping of policies")
     keys = {requests.version(key, "a key of the mapping of policies"): key for key in policy}
     if len(keys) < len(policy):
         raise InvalidArgumentError(f"the mapping of policies has a version twice: {', '.join(map(repr, policy))}")

@@ -28,7 +28,7 @@ PROGRAM = "perturb"
 VARIABLE = "PERTURB_PROGRAM"
 # Path of `perturb` inside an installed wheel. Some wheels do not contain it.
 BUNDLED = Path(__file__).with_name("_programs") / PROGRAM
-# Interval at which a training's log is read for the progress, s.
+# Interval at which the log of a training is read to show the training's progress, s.
 _POLL_INTERVAL = 0.2
 # Exit status with which `perturb` reports a wrong argument.
 _USAGE = 2

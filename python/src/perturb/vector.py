@@ -132,7 +132,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         # The parameters that `set_parameters` set for an environment's next episode, by slot.
         self._next_parameters: dict[int, requests.Intervals] = {}
         # In next-step mode, the mask of environments whose next step is an autoreset, which has no reward and no reward
-        # terms. The mask is updated only if `_keeps_resetting` is true, because nothing else needs it.
+        # terms. Steps update the mask only if `_keeps_resetting` is true: with reward terms, or after a call of
+        # `set_parameters`. Otherwise the mask is not needed.
         self._resetting = np.zeros(self.num_envs, dtype=np.bool_)
         self._keeps_resetting = reward_terms
         self._is_made = True
@@ -163,7 +164,8 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
                 states [M, S] for this episode.
 
         Raises:
-            InvalidArgumentError: if an argument is wrong. Nothing has changed.
+            InvalidArgumentError: if an argument is wrong. Nothing has changed. Exception: if seeds or new parameters
+                are given for some environments only, a wrong `state` may be refused after others were reset.
             ServerConnectionError: if the server cannot be reached, or the connection broke. The environments are lost;
                 a later reset opens another session.
             ServerTimeoutError: if the server did not reply in time. The environments are lost, too.
@@ -300,7 +302,7 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
         return self._outcome(self._client.session.recv())
 
     def snapshot(self, mask: NDArray[np.bool_] | None = None) -> list[bytes]:
-        """Save the M environments that the mask [N] selects, by default all. Return M snapshots in the same order."""
+        """Save the M environments that the mask [N] selects, by default all. Return M snapshots, ordered by slot."""
         return self._client.snapshot(None if mask is None else requests.mask(mask, self.num_envs, "mask"))
 
     def restore(self, snapshots: Sequence[bytes], mask: NDArray[np.bool_] | None = None) -> NDArray[np.float32]:
@@ -308,9 +310,10 @@ class PerturbVectorEnv(CheckedAttributes, VectorEnv[NDArray[np.float32], Any, ND
 
         Returns the observations [N, O] of all environments. The rows of restored environments are the observations at
         which they were saved. The rows of the other environments are their last observations. After the restore, the
-        same actions give the same bytes as after the snapshot was saved. If one snapshot cannot be restored, no
-        environment changes. Snapshots of more than 2 MiB in total are restored in parts. If one part is refused, the
-        snapshots of the parts before it stay restored.
+        same actions give the same bytes as after the snapshot was saved.
+
+        If the snapshots have at most 2 MiB in total, either all are restored or none. Otherwise they are sent in parts.
+        If one part is refused, the snapshots of the parts before it stay restored.
         """
         selected = None
         if mask is not None:

@@ -178,7 +178,7 @@ impl File {
             let expected = format!("as above, perturb/{name}-v{first}");
             require(first == revision, "environments", format!("`{written}`"), expected)?;
         }
-        // Replaces the names of environments and versions.
+        // Replaces the names of environments and versions by their usual spelling.
         let spell_environments =
             |names: &mut Vec<String>| names.iter_mut().for_each(|name| *name = environment(name).0);
         let spell_versions = |names: &mut Vec<String>| {

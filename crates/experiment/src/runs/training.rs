@@ -20,8 +20,9 @@ pub struct TrainingStatus {
     pub path: PathBuf,
     /// The settings of the training.
     pub config: TrainConfig,
-    /// Number of finished episodes that count towards the budget. While the training runs, it comes from the last line
-    /// of `progress.csv`, otherwise from the last checkpoint, where the training would resume.
+    /// Number of finished episodes that count towards the budget. While the training runs, it is the larger of the
+    /// numbers in the last line of `progress.csv` and in the last checkpoint. Otherwise it is the number in the last
+    /// checkpoint, from which the training would resume.
     pub episodes: u64,
     /// The last line of `progress.csv`; `None` before the first line.
     pub progress: Option<LastProgress>,

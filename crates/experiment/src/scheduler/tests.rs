@@ -49,8 +49,9 @@ fn done() -> Vec<Act> {
 }
 
 /// A backend that follows a script. `script` gets a cell and the number of the attempt at the cell, from 1, and returns
-/// the actions of this attempt. With `RECORDS_CRASHES` the backend records crashes as failures and reports ends, as
-/// [`Local`] does. Otherwise it does neither, like jobs of a cluster.
+/// the actions of this attempt. With `RECORDS_CRASHES`, the scheduler records a cell as failed whose process crashed too
+/// often, and expects the backend to report the end of each started cell, as with [`Local`]. Otherwise it does neither,
+/// as with jobs of a cluster.
 struct Fake<'a, const RECORDS_CRASHES: bool> {
     place: &'a Place,
     script: &'a dyn Fn(usize, usize) -> Vec<Act>,

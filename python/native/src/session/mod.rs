@@ -36,7 +36,7 @@ pub use exchange::note_fork;
 pub use opened::PythonOpened;
 pub use transport::NamedServer;
 
-/// Maximum number of steps that may be sent before the first reply is received. It bounds the memory of stored replies.
+/// Maximum number of steps that were sent and whose reply was not received yet. It bounds the memory of stored replies.
 const MAX_STEPS_UNDER_WAY: usize = 64;
 /// The outcome of a step: observations, rewards, terminated flags, truncated flags, and episodes that began or ended.
 type StepArrays<'py> = (
@@ -129,7 +129,8 @@ impl PythonSession {
         *unpoisoned(&self.timeout) = duration(seconds);
     }
 
-    /// Whether the server restored a snapshot into an environment. A long restore may fail after its first requests.
+    /// Whether the server restored a snapshot into an environment. Also true if a restore in several requests failed
+    /// after the first of them.
     #[getter]
     fn restored(&self) -> bool {
         self.restored.load(Ordering::Relaxed)
@@ -379,7 +380,8 @@ impl PythonSession {
                 format!("snapshots has {given} entries, expected {selected}: one for each selected environment");
             return Err(failure(INVALID, 0, words));
         }
-        // Send a wrong number of snapshots in one request, so that the server refuses it with its own message.
+        // If the number of snapshots is wrong, send all in one request, so that the server refuses it with its own
+        // message.
         let all = 0..given;
         let parts = if given == selected { parts } else { vec![all] };
         for part in parts {
