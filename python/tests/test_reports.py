@@ -39,7 +39,7 @@ def test_a_report_without_an_experiment_shows_only_the_agent(assessment: perturb
     assert page.count("<svg") == 4, "1 figure of the finding, 2 over parameters (trained on D and R), 1 of profiles"
     metrics = rows(page, "pushes (trained elsewhere)")[0]
     assert f">{assessment['DD'].success_percent:.1f}<" in metrics
-    assert page.count("steps of training not known") == 2
+    assert page.count("training steps: not known") == 2
 
 
 def test_a_report_beside_an_experiment_has_the_agent_in_its_tables(

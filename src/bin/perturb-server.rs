@@ -320,7 +320,7 @@ fn grpc_target(listeners: &[Listener]) -> Option<String> {
 async fn reload_on_hangup(mut hangups: tokio::signal::unix::Signal, reloader: Reloader) {
     while hangups.recv().await.is_some() {
         if !reloader.reload() {
-            tracing::info!("SIGHUP came, and there is no file of tokens or TLS to read again");
+            tracing::info!("received SIGHUP, but the server has no token or TLS files to reload");
         }
     }
 }
@@ -329,7 +329,7 @@ async fn reload_on_hangup(mut hangups: tokio::signal::unix::Signal, reloader: Re
 fn raise_descriptors() {
     let limit = getrlimit(Resource::Nofile);
     if let Err(error) = setrlimit(Resource::Nofile, Rlimit { current: limit.maximum, ..limit }) {
-        tracing::debug!(%error, "the limit of file descriptors stays");
+        tracing::debug!(%error, "cannot raise the limit of file descriptors");
     }
 }
 

@@ -7,7 +7,10 @@ pub type Id = [u8; 16];
 
 /// The operating system provides no random bits, so the server cannot make a name that nobody can guess.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-#[error("the system gives no random numbers; ask for no lease, or name a world by the setting world_name")]
+#[error(
+    "the operating system provides no random numbers; open without a lease, or name the world with the setting \
+     world_name"
+)]
 pub struct NoRandomness;
 
 impl RequestError for NoRandomness {

@@ -65,7 +65,10 @@ impl Security {
         };
         reload(&before).map_err(wrong)?;
         if tokens.count() == 0 {
-            tracing::warn!("{} has no token: nobody can call by TCP", path.display());
+            tracing::warn!(
+                "{} contains no token, so all calls over TCP except health checks are refused",
+                path.display()
+            );
         }
         self.watches.push(FileWatcher::start("tokens", vec![path], before, reload)?);
         Ok(tokens)
@@ -79,7 +82,7 @@ impl Security {
         let tls = Tls::new(files, &before).map_err(wrong)?;
         let reloaded = tls.clone();
         let reload = move |contents: &[Vec<u8>]| reloaded.reload(contents);
-        self.watches.push(FileWatcher::start("the files of TLS", paths, before, reload)?);
+        self.watches.push(FileWatcher::start("the TLS files", paths, before, reload)?);
         Ok(tls)
     }
 }

@@ -173,7 +173,7 @@ async fn the_program_tells_whether_a_server_takes_sessions() {
     server.ended().await;
     for address in [&tcp, &unix] {
         let (code, words) = ask(address);
-        assert!(code == Some(1) && words.contains("no server answers at"), "{code:?}: {words}");
+        assert!(code == Some(1) && words.contains("the health check of the server at"), "{code:?}: {words}");
     }
     let silent = TcpListener::bind("127.0.0.1:0").unwrap();
     let (code, words) = ask(&format!("tcp://{}", silent.local_addr().unwrap()));

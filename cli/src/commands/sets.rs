@@ -166,7 +166,7 @@ mod tests {
         let refused = read("step=3").unwrap_err().to_string();
         assert_eq!(
             refused,
-            "the success threshold is step=3, but must be one of steps, e.g. steps=100 (did you mean `steps`?)"
+            "the success threshold is step=3, but must be a threshold for steps, e.g. steps=100 (did you mean `steps`?)"
         );
         let unknown = normalize_rule(&"steps=3".parse().unwrap(), None, None).unwrap_err().to_string();
         assert!(unknown.contains("does not report the quantity of its success rule"), "{unknown}");

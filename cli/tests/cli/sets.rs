@@ -263,7 +263,7 @@ fn unknown_parameters_are_refused_at_the_start() {
     for (from, to, part) in [
         ("mass = 0.2", "size = 0.2", "`size`, but must be one of force, length, mass"),
         ("mass = 0.2", "mass = -1", "mass of CartPole is -1, but must be within"),
-        ("steps=15", "metres=15", "metres=15, but must be one of steps"),
+        ("steps=15", "metres=15", "metres=15, but must be a threshold for steps"),
         ("steps=15", "steps=201", "at most 200, the step limit"),
         ("CartPole = 'steps", "CartPool = 'steps", "`CartPool`, but must be one of CartPole"),
         ("length = '0.7..0.8,0.9..1.0'\nmass = 0.2", "version = 'R'", "without parameters"),

@@ -201,7 +201,10 @@ fn an_experiment_over_two_task_folders_is_reported_and_audited() {
     fs::remove_file(folder.cell(&plan.cells[1].id).path().join("result.json")).expect("removed");
     let output = run(&[]);
     let said = stderr(&output);
-    assert!(said.contains("was trained in ReachingArm with the model ") && said.contains("or give another --out"));
+    assert!(
+        said.contains("was trained in ReachingArm with the model ")
+            && said.contains("or choose another folder with --out")
+    );
     assert_eq!(output.status.code(), Some(2), "{said}");
     fs::remove_dir_all(place.path("dog")).expect("removed");
     let output = run(&[]);

@@ -197,5 +197,5 @@ fn a_result_that_its_episodes_do_not_give_is_not_exported() {
     write(&plan, &folder);
     records([9, 9, 3]).write(&folder.cell(&plan.cells[0].id).path().join(FILE)).unwrap();
     let message = export(&plan, &folder, "study", |_, _| {}).unwrap_err().to_string();
-    assert!(message.contains("does not follow from its recorded episodes"), "{message}");
+    assert!(message.contains("does not match its recorded episodes"), "{message}");
 }

@@ -195,7 +195,7 @@ pub enum FolderError {
     /// The server's model of the environment differs from the model of a stored result.
     #[error(
         "cell {cell} was trained in {environment} with the model {trained}, but the server has {served}: serve the \
-         task's original files, or give another --out"
+         task's original files, or choose another folder with --out"
     )]
     OtherModel { cell: String, environment: String, trained: String, served: String },
     /// Two results in one environment were trained with different models.
@@ -212,7 +212,10 @@ pub enum FolderError {
         reason: String,
     },
     /// The folder has no `plan.toml`, so it holds no experiment.
-    #[error("{} holds no experiment: expected plan.toml in it; give the --out of `perturb run`", path.display())]
+    #[error(
+        "{} holds no experiment: expected plan.toml in it; pass the folder that `perturb run --out` wrote",
+        path.display()
+    )]
     NoPlan { path: PathBuf },
 }
 

@@ -83,14 +83,14 @@ pub enum NoHeatmap {
     #[error("no heatmap, since this training has no result yet")]
     NoResult,
     /// No complete heatmap was found.
-    #[error("the heatmap has not been made")]
+    #[error("no complete heatmap was found")]
     NotMade,
     /// The result of the cell was replaced after the heatmap was made.
     #[error("the heatmap is of an earlier result")]
     Outdated,
     /// The grid or the number of episodes differs from the heatmap of an earlier run, so the two heatmaps cannot be
     /// averaged.
-    #[error("the heatmap has another grid or other episodes than that of an earlier run")]
+    #[error("the heatmap's grid or number of episodes differs from that of an earlier run")]
     NotAlike,
 }
 

@@ -125,7 +125,7 @@ impl Plan {
     pub fn of_study(name: &str, study: &StudyPlan) -> Result<Self, PlanError> {
         let read_csv_file = |file: &str| {
             let content = study.csv_files.get(file).map(|content| content.clone().into_bytes());
-            content.ok_or_else(|| format!("`{file}`, which the table does not have"))
+            content.ok_or_else(|| format!("`{file}`, which is not in the table"))
         };
         Self::parse_with(&format!("the study {name}"), study.plan.clone(), Path::new(""), &read_csv_file)
     }

@@ -17,7 +17,7 @@ pub enum VerifyError {
     Records(#[from] RecordsError),
     /// A test in the result differs from the numbers computed from its recorded episodes.
     #[error(
-        "the result of cell {cell} does not follow from its recorded episodes: its test on {test} has {kept} in \
+        "the result of cell {cell} does not match its recorded episodes: its test on {test} has {kept} in \
          result.json, but {recorded} in {file}; delete result.json to run the tests again",
         file = perturb_records::FILE
     )]
@@ -32,8 +32,8 @@ pub enum VerifyError {
     /// The result's comparison of requested and applied parameters differs from the comparison computed from the
     /// recorded episodes.
     #[error(
-        "the result of cell {cell} does not follow from its recorded episodes: its check of requested and applied \
-         parameters has another outcome; delete result.json to run the tests again"
+        "the result of cell {cell} does not match its recorded episodes: its check of requested and applied \
+         parameters has a different outcome; delete result.json to run the tests again"
     )]
     ParameterCheck { cell: String },
 }
@@ -114,7 +114,7 @@ mod tests {
     #[rstest]
     #[case(|_: &mut CellResult| (), None)]
     #[case(|result: &mut CellResult| result.results.get_mut("D").unwrap().mean_return += 1e-9, Some("its test on D has 3 episodes"))]
-    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("parameters has another outcome"))]
+    #[case(|result: &mut CellResult| result.agreement.as_mut().unwrap().episodes = 2, Some("has a different outcome"))]
     fn a_result_must_agree_with_its_records(#[case] change: fn(&mut CellResult), #[case] refused: Option<&str>) {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let directory = tempfile::tempdir().unwrap();

@@ -156,7 +156,7 @@ impl Ledgers {
                 return Err(format!("line {} of {} {what}", n + 1, path.display()));
             }
             if ledgers.heads.iter().any(|head| head.digest == chain.head()) {
-                return Err(format!("{} was given already, by this or another name", path.display()));
+                return Err(format!("{} was given twice, possibly under another name", path.display()));
             }
             ledgers.heads.push(Head {
                 path: path.clone(),
@@ -287,8 +287,10 @@ impl Ledgers {
         if drawn < episodes || own.is_empty() {
             let name =
                 format!("{}, seed {}, trained on {}", training.environment, training.seed, training.trained_on());
-            let few =
-                format!("of the {episodes} episodes of its training, {name}, {drawn} were drawn: give all ledgers");
+            let few = format!(
+                "the ledgers record only {drawn} of the {episodes} episodes of its training ({name}): pass the ledgers \
+                 of all servers"
+            );
             proof.against.push(few);
         }
         // If the end of an environment's draws is not recorded, the training may have lasted until its server process

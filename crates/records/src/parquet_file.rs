@@ -210,7 +210,7 @@ impl ParquetFile {
         let metadata = reader.metadata().file_metadata().key_value_metadata();
         let about = metadata.and_then(|pairs| pairs.iter().find(|pair| pair.key == KEY));
         let about = about.and_then(|pair| pair.value.clone());
-        let about = about.ok_or_else(|| format!("its metadata have no `{KEY}`"))?;
+        let about = about.ok_or_else(|| format!("its metadata have no key `{KEY}`"))?;
         Ok(Self { reader, about })
     }
 

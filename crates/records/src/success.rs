@@ -94,7 +94,7 @@ impl Criterion {
     /// # Errors
     /// [`ValueError`] if the threshold is for another quantity, or above the step limit.
     pub fn with(&self, threshold: &Threshold) -> Result<Self, ValueError> {
-        let expected = format!("one of {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
+        let expected = format!("a threshold for {}, e.g. {}={}", self.quantity, self.quantity, self.threshold);
         require(threshold.quantity == self.quantity, THRESHOLD, threshold, expected)?;
         let most = self.most.unwrap_or(f64::INFINITY);
         require(threshold.value <= most, THRESHOLD, threshold, format!("at most {most}, the step limit"))?;
@@ -231,7 +231,10 @@ mod tests {
             "the rule of success is code, but must be left out: the server does not report the success rule of the \
              paper's code"
         );
-        assert!(refused("steps_in_a_row=70").contains("must be one of steps"), "no criterion compares this quantity");
+        assert!(
+            refused("steps_in_a_row=70").contains("must be a threshold for steps"),
+            "no criterion compares this quantity"
+        );
         for rule in ["text", "code", "steps=90"] {
             assert_eq!(rule.parse::<Rule>().unwrap().to_string(), rule);
         }
@@ -243,7 +246,7 @@ mod tests {
         let criterion = steps(Side::AtMost, 80.0);
         assert_eq!(criterion.with(&"steps=90".parse().unwrap()).unwrap().threshold, 90.0);
         let error = criterion.with(&"distance=90".parse().unwrap()).unwrap_err().to_string();
-        assert_eq!(error, "the success threshold is distance=90, but must be one of steps, e.g. steps=80");
+        assert_eq!(error, "the success threshold is distance=90, but must be a threshold for steps, e.g. steps=80");
         let error = criterion.with(&"steps=501".parse().unwrap()).unwrap_err().to_string();
         assert_eq!(error, "the success threshold is steps=501, but must be at most 500, the step limit");
         for text in ["90", "steps=", "steps=x", "steps=nan"] {

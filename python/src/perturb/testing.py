@@ -56,9 +56,7 @@ def replay(
         given = {keys[0]: given[None]}
     if set(given) != set(keys):
         expected = "one policy" if keys == [None] else f"a mapping with the keys {', '.join(map(repr, keys))}"
-        raise InvalidArgumentError(
-            f"the given policies are not those of the recorded tests; expected {expected}"
-        )
+        raise InvalidArgumentError(f"the given policies are not those of the recorded tests; expected {expected}")
     episodes, different = 0, []
     for one in recorded:
         known, records = one.known, one.records

@@ -64,17 +64,17 @@ impl Ledger {
     pub fn open(path: &Path) -> io::Result<Self> {
         if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
             return Err(io::Error::other(
-                "that is not a regular file, and the server must read its ledger at each start",
+                "this is not a regular file, but the server must read its ledger at each start",
             ));
         }
         let file = OpenOptions::new().read(true).append(true).create(true).mode(0o600).open(path)?;
         if !file.metadata()?.is_file() {
             return Err(io::Error::other(
-                "that is not a regular file, and the server must read its ledger at each start",
+                "this is not a regular file, but the server must read its ledger at each start",
             ));
         }
         if is_acquired(file.try_lock(), path)? == Some(false) {
-            return Err(io::Error::other("another server writes it"));
+            return Err(io::Error::other("another server is writing to it"));
         }
         let existing = read(path, |_, _| {}).map_err(io::Error::other)?;
         if existing.chain.lines() == 0 && existing.unfinished > 0 {
@@ -124,11 +124,11 @@ impl Ledger {
         // too.
         let size = line_bytes(&event);
         if size as u64 > MAX_LINE_BYTES / 2 {
-            let got = format!("{size} bytes as a line of this server's ledger");
+            let got = format!("{size} bytes");
             return Err(InvalidValue::new(
-                "what is to be drawn",
+                "the length of the request's line in this server's ledger",
                 got,
-                format!("at most {}: ask for less at a time", MAX_LINE_BYTES / 2),
+                format!("at most {}: request fewer draws at a time", MAX_LINE_BYTES / 2),
             )
             .into());
         }
@@ -137,7 +137,7 @@ impl Ledger {
         let reason = match written.await {
             Ok(Ok(())) => return Ok(size),
             Ok(Err(reason)) => reason,
-            Err(_) => "its thread is gone".into(),
+            Err(_) => "the ledger's thread has ended".into(),
         };
         Err(Error::NoLedger { reason })
     }
@@ -227,7 +227,7 @@ impl LedgerWriter {
                     self.path.display()
                 );
             }
-            (Ok(()), true) => tracing::info!("the ledger {} is there again", self.path.display()),
+            (Ok(()), true) => tracing::info!("the ledger {} is intact again", self.path.display()),
             _ => {}
         }
         found

@@ -80,7 +80,7 @@ impl FileWatcher {
                     match now.as_ref().map_err(Clone::clone).and_then(|contents| reload(contents)) {
                         Ok(()) => tracing::info!("read {what} again"),
                         Err(reason) => {
-                            tracing::error!("{what} changed, but the previous contents stay in force: {reason}")
+                            tracing::error!("{what} cannot be reloaded; the previous contents stay in force: {reason}")
                         }
                     }
                     loaded.clone_from(&now);

@@ -68,6 +68,10 @@ impl TokenRole {
             return Ok(());
         }
         let names: Vec<String> = draws.iter().map(DrawSet::to_string).collect();
-        Err(format!("it may draw from {} alone", if names.is_empty() { "nothing".into() } else { names.join(" and ") }))
+        Err(if names.is_empty() {
+            "it may not draw from any region".into()
+        } else {
+            format!("it may draw only from {}", names.join(" and "))
+        })
     }
 }

@@ -91,8 +91,8 @@ fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Respons
             }
             Err(error) => (StatusCode::INTERNAL_SERVER_ERROR, "text/plain", format!("{error}\n")),
         },
-        (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "ask with GET or HEAD\n".into()),
-        _ => (StatusCode::NOT_FOUND, "text/plain", format!("ask for {PATH}\n")),
+        (PATH, _) => (StatusCode::METHOD_NOT_ALLOWED, "text/plain", "use GET or HEAD\n".into()),
+        _ => (StatusCode::NOT_FOUND, "text/plain", format!("the metrics are at {PATH}\n")),
     };
     let mut response = Response::new(Full::new(text.into()));
     *response.status_mut() = status;

@@ -89,7 +89,7 @@ impl MetricsCollector {
                 [(labels("done"), done as f64), (labels("refused"), refused as f64)]
             })
         });
-        page.counters("perturb_requests", "Requests of sessions that were answered", each)?;
+        page.counters("perturb_requests", "Answered requests of sessions", each)?;
         let named: Vec<_> = errors.counts().map(|(kind, n)| (code_name(kind.code()), kind.reason(), n)).collect();
         let each = named.iter().map(|(code, reason, n)| ([("code", code.as_str()), ("reason", reason)], *n as f64));
         page.counters("perturb_refusals", "Requests, calls and sessions that were refused or ended, by reason", each)?;

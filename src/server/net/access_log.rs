@@ -127,7 +127,7 @@ impl AccessLog {
     fn log_left_out(&self) {
         let window = self.lock().window.take();
         let left_out = window.map_or(0, |(_, n_ended)| n_ended.saturating_sub(MAX_LINES_PER_WINDOW));
-        tracing::info!(target: "perturb::access", left_out, "more sessions ended than there are lines for");
+        tracing::info!(target: "perturb::access", left_out, "omitted lines for further ended sessions");
     }
 
     fn lock(&self) -> MutexGuard<'_, LogState> {

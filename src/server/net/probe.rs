@@ -20,10 +20,10 @@ pub enum Error {
     #[error(transparent)]
     Address(#[from] AddressError),
     /// The path of the Unix socket is relative, and the working directory no longer exists.
-    #[error("a relative path of a socket: {0}")]
+    #[error("the socket's path is relative, and the working directory cannot be found: {0}")]
     Directory(#[from] io::Error),
     /// The server did not answer or does not accept sessions, or the certificate cannot be read.
-    #[error("no server answers at {address}: {reason}")]
+    #[error("the health check of the server at {address} failed: {reason}")]
     NoAnswer {
         /// The address.
         address: Address,

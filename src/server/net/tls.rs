@@ -57,7 +57,7 @@ fn certificates(path: &std::path::Path, pem: &[u8]) -> Result<Vec<CertificateDer
     let all: Result<Vec<_>, _> = CertificateDer::pem_slice_iter(pem).collect();
     let all = all.map_err(|error| format!("{}: {error}; expected certificates in PEM", path.display()))?;
     if all.is_empty() {
-        return Err(format!("{}: there is no certificate; expected some in PEM", path.display()));
+        return Err(format!("{} contains no certificate; expected at least one in PEM", path.display()));
     }
     Ok(all)
 }

@@ -55,7 +55,7 @@ pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: Transport
         match listener.accept().await {
             Ok((socket, peer)) => match limiter.acquire(Some(peer)) {
                 Ok(permit) => threads.hand_over(socket, peer, permit),
-                Err(full) => tracing::debug!(?peer, ?full, "closed a connection for which there is no place"),
+                Err(full) => tracing::debug!(?peer, ?full, "refused a connection above the limit"),
             },
             Err(error) => {
                 // Most likely the process is out of file descriptors. Retrying at once would keep this thread from

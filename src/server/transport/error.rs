@@ -42,14 +42,15 @@ pub enum Error {
     /// A compressed message has more bytes, when decompressed, than the limit that applies to its stream at this
     /// moment.
     #[error(
-        "a compressed message has more than {limit} bytes when it is decompressed; at most {limit} are read here now"
+        "a compressed message has more than {limit} bytes when it is decompressed, which is the limit of this stream \
+         at present"
     )]
     DecompressedTooLarge {
         /// The maximum length after decompression, bytes.
         limit: usize,
     },
     /// A message is longer than the limit that applies to its stream at this moment.
-    #[error("a message of {got} bytes came; at most {limit} are read here now")]
+    #[error("a message has {got} bytes; the limit of this stream is {limit} bytes at present")]
     TooLarge {
         /// The length of the message, bytes.
         got: usize,

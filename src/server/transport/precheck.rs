@@ -152,8 +152,8 @@ fn count(mut message: &[u8], fields: &[Field], limits: RequestLimits, work: &mut
             5 => message.split_off(..4),
             // Wire types 3 and 4 are groups, which proto3 does not have. Types 6 and 7 do not exist.
             kind => {
-                let got = format!("with a field of the encoding's kind {kind}");
-                return Err(PrecheckError::Refused(InvalidValue::new("request", got, "kinds 0, 1, 2 and 5")));
+                let got = format!("with a field of wire type {kind}");
+                return Err(PrecheckError::Refused(InvalidValue::new("request", got, "wire types 0, 1, 2 and 5")));
             }
         };
         let Some(part) = part else { return Ok(false) };

@@ -131,7 +131,7 @@ async fn new_certificates_are_loaded_and_broken_ones_are_not() {
 
     let other = Authority::new("another authority");
     other.issue(encrypted.directory.path(), "server", &["127.0.0.1"], 2040);
-    logged(&encrypted.server, "read the files of TLS again").await;
+    logged(&encrypted.server, "read the TLS files again").await;
     let ca = other.file(encrypted.directory.path(), "another.pem");
     connect(encrypted.address(), &[(CA, &ca)]).await.unwrap();
     unsafe_words(connect(encrypted.address(), &[(CA, &encrypted.ca)]).await);

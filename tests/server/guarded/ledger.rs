@@ -122,7 +122,7 @@ async fn refusals_are_written_down_and_a_server_that_ends_says_so() {
     assert_eq!(self::entries(&path).len(), 6);
     let second = command().args(flags).args(["--listen", "tcp://127.0.0.1:0"]).output().unwrap();
     let words = String::from_utf8(second.stderr).unwrap();
-    assert!(words.contains("another server writes it") && second.status.code() == Some(2), "{words}");
+    assert!(words.contains("another server is writing to it") && second.status.code() == Some(2), "{words}");
     drop(server);
     let text = std::fs::read_to_string(&path).unwrap();
     std::fs::write(&path, text.replacen("bob", "eve", 1)).unwrap();
@@ -266,7 +266,7 @@ async fn a_ledger_that_was_tampered_with_is_noticed(#[case] tampering: Tampering
         Tampering::Deleted | Tampering::Replaced => std::fs::rename(&aside, &path).unwrap(),
         Tampering::Truncated | Tampering::Lengthened => std::fs::write(&path, &whole).unwrap(),
     }
-    logged(&server, "is there again").await;
+    logged(&server, "is intact again").await;
     let (other, _) = within(Stream::open(&connection, open("CartPole", 1, 3))).await.unwrap();
     assert_eq!(Page::scrape(&metrics).number("perturb_ledger_intact"), 1.0);
     assert!(Page::scrape(&metrics).number("perturb_ledger_bytes") > whole.len() as f64);

@@ -39,7 +39,7 @@ fn reachable_address_is_guarded_or_called_insecure(#[case] flags: &[&str], #[cas
 #[case::devices(&["--tls-cert", "/dev/null", "--tls-key", "/dev/null"], "expected a regular file")]
 #[case::endless_tokens(&["--tokens", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::folder(&["--tokens", "/"], "it is a folder, expected a file")]
-#[case::endless_ledger(&["--ledger", "/dev/zero"], "that is not a regular file")]
+#[case::endless_ledger(&["--ledger", "/dev/zero"], "this is not a regular file")]
 #[case::endless_config(&["--config", "/dev/zero"], "cannot read /dev/zero: it is a pipe or a device")]
 #[case::decimal(&["--socket-mode", "438"], "not a mode of a socket")]
 #[case::executable(&["--socket-mode", "0700"], "such as 0600")]
@@ -89,7 +89,7 @@ fn a_file_without_a_certificate_is_refused() {
     let mut command = command();
     command.args(["--listen", "tcp://127.0.0.1:0", "--tls-key"]).arg(file.path()).arg("--tls-cert").arg(file.path());
     let words = refused(command);
-    assert!(words.contains("there is no certificate"), "{words}");
+    assert!(words.contains("contains no certificate"), "{words}");
 }
 
 #[test]

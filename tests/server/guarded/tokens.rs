@@ -112,7 +112,7 @@ async fn hangup_reads_files_again_and_ends_nobody() {
     steps(&mut session, 1).await.expect("no session ends");
     let unguarded = Server::start(&[]);
     unguarded.signal("HUP");
-    logged(&unguarded, "no file of tokens or TLS to read again").await;
+    logged(&unguarded, "no token or TLS files to reload").await;
     let plain = connect(unguarded.tcp(), &[]).await.unwrap();
     begin(&plain, 1).await.unwrap();
 }

@@ -39,9 +39,9 @@ fn the_address_is_printed_after_those_of_sessions() {
 }
 
 #[rstest]
-#[case("GET /", "404", "ask for /metrics")]
-#[case("GET /metrics/", "404", "ask for /metrics")]
-#[case("POST /metrics", "405", "ask with GET or HEAD")]
+#[case("GET /", "404", "the metrics are at /metrics")]
+#[case("GET /metrics/", "404", "the metrics are at /metrics")]
+#[case("POST /metrics", "405", "use GET or HEAD")]
 fn what_is_no_page_says_where_it_is(#[case] line: &str, #[case] status: &str, #[case] words: &str) {
     let watched = Watched::start(&[]);
     let (head, body) = page::asked(page::unix(&watched.socket), line);

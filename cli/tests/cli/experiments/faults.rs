@@ -18,7 +18,7 @@ fn a_failing_disk_ends_the_run_and_keeps_results() {
     let output = disk::with_file_limit(&experiment.command("out", &arguments), BLOCKS).output().expect("ended");
     let said = stderr(&output);
     assert_eq!(output.status.code(), Some(1), "{said}");
-    assert!(said.contains("the run cannot go on: CartPole-a2c-ff-D-") && said.contains("File too large"), "{said}");
+    assert!(said.contains("the run cannot continue: CartPole-a2c-ff-D-") && said.contains("File too large"), "{said}");
     assert!(said.contains("resume with the same command"), "{said}");
     assert!(experiment.results("out").is_empty());
     let cells = experiment.out("out").join("cells");
@@ -48,7 +48,7 @@ fn a_run_resumes_after_a_full_disk() {
     let said = stderr(&output);
     assert!(output.status.success(), "{}: {said}", output.status);
     let (first, _) = said.split_once("first status 1").expect(&said);
-    assert!(first.contains("the run cannot go on: CartPole-a2c-ff-"), "{said}");
+    assert!(first.contains("the run cannot continue: CartPole-a2c-ff-"), "{said}");
     assert!(first.contains("No space left on device"), "{said}");
     assert_eq!(experiment.results("kept/run"), experiment.results("undisturbed"));
 }

@@ -56,7 +56,7 @@ fn a_group_finishes_although_its_process_is_killed() {
     let place = |cell: usize| ExperimentFolder::new(&experiment.out("out")).cell(&experiment.plan.cells[cell].id);
     let first = &experiment.plan.cells[0].id;
     let log = std::fs::read_to_string(place(2).log()).expect("a log");
-    assert!(log.starts_with(&format!("done together with {first}: see ../{first}/log.txt\n")), "{log}");
+    assert!(log.starts_with(&format!("runs in one process with {first}: see ../{first}/log.txt\n")), "{log}");
 }
 
 #[test]
@@ -216,7 +216,7 @@ fn a_lost_server_is_no_cells_failure() {
     kill("-KILL", server.process_id());
     let output = ended(child);
     assert_eq!(output.status.code(), Some(1));
-    assert!(stderr(&output).contains("cannot go on without a server"), "{}", stderr(&output));
+    assert!(stderr(&output).contains("cannot continue without a server"), "{}", stderr(&output));
     let folder = ExperimentFolder::new(&experiment.out("out"));
     assert!(experiment.plan.cells.iter().all(|cell| !folder.cell(&cell.id).is_settled(true)));
 

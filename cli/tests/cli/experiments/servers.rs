@@ -33,7 +33,8 @@ fn a_run_gives_same_results_after_its_server_restarts() {
     let said = experiment.out("said");
     let mut command = experiment.command("out", &arguments);
     let child = command.stderr(File::create(&said).expect("a file")).spawn().expect("started");
-    let losses = || std::fs::read_to_string(&said).expect("words").matches("; waiting for it, at most").count();
+    let losses =
+        || std::fs::read_to_string(&said).expect("words").matches("; waiting for a server for at most").count();
     let training = |name: &str, cell: usize| {
         ExperimentFolder::new(&experiment.out(name)).cell(&experiment.plan.cells[cell].id).training()
     };

@@ -145,7 +145,7 @@ impl Expansion<'_> {
                 common.environment, common.architecture, common.seed
             );
             if let Some(first) = self.tables.insert(id.clone(), name.to_owned()) {
-                return Err(format!("{first} and {name} both ask for {id}: take it out of one of them").into());
+                return Err(format!("{first} and {name} both contain the cell {id}: remove it from one of them").into());
             }
             let (configuration, set, tests) = (configuration.clone(), set.clone(), tests.clone());
             let tuned_as = tuned_as.clone();

@@ -78,7 +78,7 @@ fn read_set(
 /// Reads the CSV file `file` in `folder`. The error is a phrase for [`ReadCsvFile`].
 pub(super) fn content(file: &str, folder: &Path) -> Result<Vec<u8>, String> {
     if Path::new(file).components().count() != 1 || file.starts_with('.') || !file.ends_with(".csv") {
-        return Err(format!("`{file}`, which is not the name of a file .csv"));
+        return Err(format!("`{file}`, which is not the name of a .csv file"));
     }
     let path = folder.join(file);
     let refused = |reason: &dyn std::fmt::Display| format!("`{}`, which cannot be read ({reason})", path.display());

@@ -275,7 +275,7 @@ fn a_cell_asked_for_twice_is_refused() {
         .unwrap_err()
         .to_string();
     assert!(
-        message.contains("[[algorithm]] 2 (ppo) and [[algorithm]] 3 (ppo) both ask for CartPole-ppo-ff-E-"),
+        message.contains("[[algorithm]] 2 (ppo) and [[algorithm]] 3 (ppo) both contain the cell CartPole-ppo-ff-E-"),
         "{message}"
     );
 }

@@ -212,7 +212,7 @@ fn read_plan(folder: &ExperimentFolder, within: Option<&Path>) -> Result<Plan, A
     if within.is_some() && plan.cells.len() > MAX_FOLLOWED_CELLS {
         let (cells, most) = (grouped(plan.cells.len()), grouped(MAX_FOLLOWED_CELLS));
         return Err(
-            format!("its {cells} cells are too many to follow, expected {most} at most; ask `perturb ls`").into()
+            format!("the plan has {cells} cells, but at most {most} can be shown here; use `perturb ls`").into()
         );
     }
     if let Some(root) = within.filter(|_| !plan.candidates.is_empty()) {
@@ -370,6 +370,6 @@ mod tests {
         assert!(matches!(&status.cells[0], CellStatus::Failed(reason) if reason.len() < 400));
         std::fs::write(folder.plan_path(), PLAN.replace("runs = 3", "runs = 50001")).unwrap();
         let error = ExperimentStatus::read_within(directory.path(), directory.path()).unwrap_err().to_string();
-        assert!(error.contains("50 001 cells are too many to follow"), "{error}");
+        assert!(error.contains("the plan has 50 001 cells"), "{error}");
     }
 }

@@ -56,7 +56,7 @@ impl RunKind {
 
 /// Returns the error message for a `path` that is not a folder.
 pub fn no_folder(path: &Path) -> String {
-    format!("there is no folder {}: give the one that your runs are in", path.display())
+    format!("there is no folder {}: pass the folder that contains your runs", path.display())
 }
 
 /// The result of a search for runs below a folder.

@@ -114,7 +114,7 @@ impl std::fmt::Display for CellEvent {
             Self::Training { episodes, .. } => write!(f, "{} of training", count(*episodes as usize, "episode")),
             Self::Testing { set, episodes } => write!(f, "{} on {set}", count(*episodes as usize, "test episode")),
             Self::Done => write!(f, "done"),
-            Self::Busy => write!(f, "another process works on it"),
+            Self::Busy => write!(f, "another process is working on it"),
             Self::Stopped { signal } => write!(f, "signal {signal} ended its process"),
             Self::Failed { reason }
             | Self::LostServer { reason }

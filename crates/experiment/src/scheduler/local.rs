@@ -104,7 +104,7 @@ impl<'a> Local<'a> {
         for offer in &group[1..] {
             let (mut log, path) = open(offer)?;
             let first = self.id(group[0].cell);
-            writeln!(log, "done together with {first}: see ../{first}/log.txt").map_err(io("write", &path))?;
+            writeln!(log, "runs in one process with {first}: see ../{first}/log.txt").map_err(io("write", &path))?;
         }
         Ok(first)
     }
@@ -398,7 +398,7 @@ mod tests {
         let read = |id: &String, name: &str| std::fs::read_to_string(folder.cell(id).path().join(name)).unwrap();
         let job: WorkerJob = serde_json::from_str(&read(first, "orders")).unwrap();
         assert_eq!(job.cells.iter().map(|it| &it.cell).collect::<Vec<_>>(), [first, second]);
-        assert_eq!(read(second, "log.txt"), format!("done together with {first}: see ../{first}/log.txt\n"));
+        assert_eq!(read(second, "log.txt"), format!("runs in one process with {first}: see ../{first}/log.txt\n"));
     }
 
     #[test]
@@ -428,6 +428,9 @@ mod tests {
             Some(BackendEvent::NoServer("the private server ended".into()))
         });
         let message = ran.end.unwrap_err().to_string();
-        assert!(message.starts_with("the run cannot go on without a server: the private server ended;"), "{message}");
+        assert!(
+            message.starts_with("the run cannot continue without a server: the private server ended;"),
+            "{message}"
+        );
     }
 }

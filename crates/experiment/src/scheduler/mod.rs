@@ -176,15 +176,15 @@ pub enum RunError {
     #[error("a worker refused its job: {0}; did another run replace the folder's plan.toml meanwhile?")]
     Refused(String),
     /// The servers have ended.
-    #[error("the run cannot go on without a server: {0}; finished work is kept")]
+    #[error("the run cannot continue without a server: {0}; finished work is kept")]
     NoServer(String),
     /// Files of a cell repeatedly could not be read or written.
-    #[error("the run cannot go on: {0}; correct this, and resume with the same command")]
+    #[error("the run cannot continue: {0}; fix this, and resume with the same command")]
     FileFault(String),
     /// Several attempts at a cell ended without progress.
     #[error(
-        "{} without a result after {MAX_ATTEMPTS} attempts, the first is {}: {words}; when this is \
-         corrected, the same command tries again",
+        "{} without a result after {MAX_ATTEMPTS} attempts; the first is {}: {words}; fix the cause, then \
+         run the same command again",
         count(ids.len(), "cell"),
         ids[0]
     )]
@@ -403,7 +403,7 @@ impl<'a> Scheduler<'a> {
                     return Err(RunError::NoServer(format!("{}: {end}", self.id(cell))));
                 } else if self.paused_until.is_none_or(|until| until < now) {
                     let wait = duration((most + pause - waited).as_secs_f64());
-                    let words = format!("{}: {end}; waiting for it, at most {wait}", self.id(cell));
+                    let words = format!("{}: {end}; waiting for a server for at most {wait}", self.id(cell));
                     (self.report)(ProgressEvent::Note(&words));
                 }
                 self.pause(cell, now + pause);

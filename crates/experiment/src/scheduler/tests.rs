@@ -309,7 +309,7 @@ fn a_killed_cell_waits_until_the_others_had_their_turn() {
 fn server_waits_double_and_end() {
     let place = Place::new();
     let ran = place.run(&|_, _| vec![lost()]);
-    let message = format!("the run cannot go on without a server: {}: gone; finished work is kept", place.id(0));
+    let message = format!("the run cannot continue without a server: {}: gone; finished work is kept", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     // Each loss is reported one second after the start. The pauses are 1, 2, 4 and 8 s.
     assert_eq!(ran.times(), [0, 2, 5, 10, 19], "at the front of the queue");
@@ -326,7 +326,7 @@ fn full_disk_ends_the_run_without_a_failed_cell() {
     assert_eq!((ran.end.clone(), ran.attempts()), (place.finished(&[]), vec![5, 1, 1, 1]), "there is room again");
     let place = Place::new();
     let ran = place.run(&|_, _| vec![server(), Wait(90), full()]);
-    let message = format!("the run cannot go on: {}: no space left; correct this, and resume", place.id(0));
+    let message = format!("the run cannot continue: {}: no space left; fix this, and resume", place.id(0));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert!((0..4).all(|cell| !place.folder.cell(place.id(cell)).is_settled(true)), "no cell is blamed");
     // Lost servers and file faults are counted separately.
@@ -449,7 +449,7 @@ fn a_refused_job_ends_the_run() {
 fn cell_is_given_up_if_machines_may_be_faulty() {
     let place = Place::new();
     let ran = place.run_on::<false>(2, false, &|cell, _| if cell == 1 { vec![killed()] } else { done() });
-    let message = format!("1 cell without a result after 3 attempts, the first is {}: signal 9; when", place.id(1));
+    let message = format!("1 cell without a result after 3 attempts; the first is {}: signal 9; fix", place.id(1));
     assert!(ran.end.as_ref().is_err_and(|error| error.starts_with(&message)), "{:?}", ran.end);
     assert_eq!(ran.attempts(), [1, 3, 1, 1]);
     assert_eq!(place.failure(1), "", "nothing is recorded");

@@ -104,7 +104,7 @@ fn one_policy_for_each_seed(condition: &str, tests: &[RowTest<'_>]) -> Result<()
         let what = if condition.is_empty() { "the condition".into() } else { format!("the condition {condition}") };
         let got =
             format!("several policies of seed {seed}, which differ by {}", differing_columns(other, row).join(", "));
-        let expected = "one policy for each seed; choose among them, or compare by what they differ by";
+        let expected = "one policy for each seed; select fewer rows, or compare by the columns in which they differ";
         return Err(ValueError::new(what, got, expected));
     }
     Ok(())

@@ -62,7 +62,8 @@ fn unequal_numbers_of_seeds_are_compared_without_pairs() {
     seeds")]
 #[case(&[9, 5], &[1, 6], "x − y on D: +3.5, but +8.0 and -1.0 by seed: two seeds decide nothing")]
 #[case(&[9, 9], &[2, 1], "x − y on D: +7.5, +7.0 and +8.0 by seed: two seeds decide nothing")]
-#[case(&[9, 5, 5], &[1], "x − y on D: +5.3 [+5.3, +5.3] over episodes: 3 and 1 seeds decide nothing, at least 3 of each can")]
+#[case(&[9, 5, 5], &[1], "x − y on D: +5.3 [+5.3, +5.3] over episodes: 3 and 1 seeds decide nothing, \
+    since each condition needs at least 3")]
 #[case(&[9, 5, 5], &[1, 2, 3], "x − y on D: +4.3 [-3.7, +12.3] over 3 pairs of seeds, p = 0.145: undecided")]
 #[case(&[9, 8, 8], &[1, 1, 1], "x has a higher mean return than y on D: +7.3 [+5.9, +8.8] over 3 pairs of seeds, p = 0.002")]
 fn the_verdict_says_what_the_seeds_say(#[case] x: &[u32], #[case] y: &[u32], #[case] expected: &str) {

@@ -43,7 +43,7 @@ pub(super) fn of_difference(it: &ConditionDifference, score: ComparedScore, comp
 /// Describes the whole comparison in one sentence. `compared` is the number of differences that have a p-value.
 pub(super) fn of_all(all: &[ConditionDifference], score: ComparedScore, compared: usize) -> String {
     let Some(largest) = all.iter().reduce(|a, b| if b.difference.abs() > a.difference.abs() { b } else { a }) else {
-        return "There is one condition, and nothing is compared".into();
+        return "There is only one condition, so nothing is compared".into();
     };
     let decided: Vec<&ConditionDifference> = all.iter().filter(|it| it.is_decided()).collect();
     match (&decided[..], all) {
@@ -87,7 +87,9 @@ fn few_seeds(it: &ConditionDifference) -> String {
     match it.seeds {
         [1, 1] => "one seed each supports no conclusion about other seeds".into(),
         [2, 2] => "two seeds decide nothing".into(),
-        [x, y] => format!("{x} and {y} seeds decide nothing, at least {MIN_RUNS_FOR_INTERVAL} of each can"),
+        [x, y] => {
+            format!("{x} and {y} seeds decide nothing, since each condition needs at least {MIN_RUNS_FOR_INTERVAL}")
+        }
     }
 }
 

@@ -161,7 +161,7 @@ impl ResultsTable {
             return Err(damaged("it is not a Parquet file".into()));
         }
         let file = ParquetFile::open(content).map_err(|error| damaged(error.to_string()))?;
-        let not_understood = |error: serde_json::Error| damaged(format!("its metadata are not understood: {error}"));
+        let not_understood = |error: serde_json::Error| damaged(format!("its metadata cannot be parsed: {error}"));
         let TableMetadata { schema_version: version, studies } =
             serde_json::from_str(file.about()).map_err(not_understood)?;
         if !(1..=SCHEMA_VERSION).contains(&version) {

@@ -58,7 +58,7 @@ fn policy_sentence(agent: &ExternalEvaluation, policy: &ExternalPolicy, run: u32
     let steps = known.timesteps.map_or("not known".into(), |steps| steps.to_string());
     let success = records.about.success.as_ref().map_or("not judged".into(), ToString::to_string);
     format!(
-        "{} on {}, run {run}: trained on {}, steps of training {steps}, policy `{}`; {} episodes a test with seed {}, \
+        "{} on {}, run {run}: trained on {}, training steps: {steps}, policy `{}`; {} episodes per test with seed {}, \
          success: {success}; {saved}.",
         agent.agent,
         agent.environment(),

@@ -101,7 +101,7 @@ fn evaluations_alone_have_a_page_without_cells() {
     let page = ReportInputs { assessed, ..ReportInputs::default() }
         .read(|whole| whole.page().map_err(ReportError::from))
         .unwrap();
-    for there in ["P&lt;PO (trained elsewhere)", "id=\"scenarios\"", "steps of training", "<svg", "id=\"heatmaps\""] {
+    for there in ["P&lt;PO (trained elsewhere)", "id=\"scenarios\"", "training steps: ", "<svg", "id=\"heatmaps\""] {
         assert!(page.contains(there), "{there}");
     }
     for not_there in ["cells are done", "Selection:", "id=\"curves\"", "Plan:", "P<PO"] {

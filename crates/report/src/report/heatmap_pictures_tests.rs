@@ -78,13 +78,13 @@ fn a_picture_is_of_the_mean_over_runs_and_says_how_many() {
         &Heatmap::mean(&[runs[0].clone(), runs[1].clone()]).unwrap()
     );
     assert_eq!(panels.columns[1].content.as_ref().unwrap(), &runs[2]);
-    assert_eq!(panels.columns[2].content, Err("the heatmap has not been made".into()));
+    assert_eq!(panels.columns[2].content, Err("no complete heatmap was found".into()));
     assert_eq!(
         picture.caption.replace(perturb_experiment::VERSION, "VERSION"),
         "Pendulum, a2c ff: mean return and success over mass and length. Means over runs: 2 runs trained on D; 1 of 2 runs \
-         trained on R (run 2: the heatmap has not been made); 0 of 2 runs trained on E (run 1: the heatmap has not been \
-         made, run 2: the heatmap has not been made). 6 × 6 points of 20 episodes of each policy, test seeds 1, 2. perturb \
-         VERSION."
+         trained on R (run 2: no complete heatmap was found); 0 of 2 runs trained on E (run 1: no complete heatmap was \
+         found, run 2: no complete heatmap was found). 6 × 6 points of 20 episodes of each policy, test seeds 1, 2. \
+         perturb VERSION."
     );
     assert_eq!((pictures.total, pictures.missing.len()), (24, 3 + 18));
     let csv = String::from_utf8(picture.data.to_csv()).unwrap();
@@ -148,7 +148,7 @@ fn mean_needs_equal_points_and_episodes() {
         let pictures = pictures(&plan, &ExperimentFolder::new(directory.path()));
         assert!(panels(&pictures.pictures[0]).columns.iter().all(|column| column.content.as_ref() == Ok(&first)));
         assert_eq!(pictures.missing, [NoHeatmap::NotAlike; 12]);
-        assert!(pictures.pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap has another grid"));
+        assert!(pictures.pictures[0].caption.contains("1 of 2 runs trained on E (run 2: the heatmap's grid"));
     }
 }
 

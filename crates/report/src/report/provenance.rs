@@ -135,7 +135,7 @@ fn selected(tuned: &[Tuned<'_>]) -> Vec<String> {
     let notes = [
         ("wait for tuning cells", waiting),
         ("have nothing to select, since all their tuning cells failed", none),
-        ("are of configurations some of whose tuning cells failed", partly),
+        ("chose a configuration with failed tuning cells", partly),
     ];
     let notes = notes.into_iter().filter(|(_, names)| !names.is_empty());
     notes.map(|(what, names)| format!("{} of {all} selections {what}: {}.", names.len(), names.join(", "))).collect()

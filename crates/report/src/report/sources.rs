@@ -79,7 +79,10 @@ pub enum ReportError {
     )]
     Neither { path: PathBuf },
     /// The inputs contain two experiments.
-    #[error("{} and {} are both experiments: a report is of one, and of any number of assessments", first.display(), second.display())]
+    #[error(
+        "{} and {} are both experiments: a report takes one experiment and any number of assessments",
+        first.display(), second.display()
+    )]
     Experiments { first: PathBuf, second: PathBuf },
 }
 

@@ -141,8 +141,7 @@ fn clean_report_names_rule_seeds_and_selection() {
          the reported configurations were trained anew on seeds 3 to 4, and tested on other episodes.",
         "1 of 3 selections wait for tuning cells: CartPole ppo ff on E.",
         "1 of 3 selections have nothing to select, since all their tuning cells failed: CartPole ppo ff on R.",
-        "1 of 3 selections are of configurations some of whose tuning cells failed: CartPole ppo ff on D (1 of 2 tuning \
-         seeds).",
+        "1 of 3 selections chose a configuration with failed tuning cells: CartPole ppo ff on D (1 of 2 tuning seeds).",
     ] {
         assert!(sentences.contains(part), "{sentences}");
     }

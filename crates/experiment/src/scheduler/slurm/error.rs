@@ -33,7 +33,10 @@ pub enum SlurmError {
     #[error("{program} printed `{got}`, expected {expected}")]
     NotUnderstood { program: &'static str, expected: &'static str, got: String },
     /// This Slurm is configured without job arrays.
-    #[error("this Slurm takes no job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb run --cell`")]
+    #[error(
+        "Slurm is configured without job arrays (MaxArraySize = 0), which --engine slurm needs; use `perturb \
+         run --cell`"
+    )]
     NoArrays,
     /// An option was refused.
     #[error(transparent)]
@@ -45,7 +48,7 @@ pub enum SlurmError {
     #[error(transparent)]
     File(#[from] FileError),
     /// The cost of cells cannot be estimated.
-    #[error("cannot estimate the durations of cells, from which jobs get their size: {0}; give --cells-per-job")]
+    #[error("cannot estimate how long cells take, which is needed to size jobs: {0}; pass --cells-per-job")]
     Cost(AnyError),
     /// The jobs of all unfinished cells were cancelled.
     #[error(

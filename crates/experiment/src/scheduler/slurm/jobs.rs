@@ -271,7 +271,7 @@ impl<'a> Jobs<'a> {
         let shown = log.display();
         match last_log_line(&log, 0) {
             Some(words) => format!("Slurm job {job} ({state}) said `{words}`, see {shown}"),
-            None => format!("Slurm job {job} ({state}) wrote nothing to {shown}: do the nodes see this folder?"),
+            None => format!("Slurm job {job} ({state}) wrote nothing to {shown}: can the nodes access its folder?"),
         }
     }
 

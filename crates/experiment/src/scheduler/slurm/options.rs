@@ -60,7 +60,7 @@ pub enum OptionError {
     /// The time limit has a format that Slurm does not accept.
     #[error(
         "`{got}` is not a time limit: expected minutes, or one of Slurm's other forms MM:SS, HH:MM:SS, DAYS-HH, \
-         DAYS-HH:MM, DAYS-HH:MM:SS, e.g. 90 or 1-12:00:00, and more than zero"
+         DAYS-HH:MM, DAYS-HH:MM:SS; it must be more than zero, e.g. 90 or 1-12:00:00"
     )]
     Time { got: String },
     /// The number of cells per job is out of range.

@@ -30,11 +30,11 @@ program={program}
 echo "job ${{SLURM_ARRAY_JOB_ID}}_${{SLURM_ARRAY_TASK_ID}} on ${{SLURMD_NODENAME}}, restarted ${{SLURM_RESTART_COUNT:-0}} times" >&2
 cells=$(sed -n "$((SLURM_ARRAY_TASK_ID + 1))p" "$cells_file")
 if [ -z "$cells" ]; then
-    echo "perturb: $SLURMD_NODENAME finds no cells in $cells_file: does it see the same folder?" >&2
+    echo "perturb: $SLURMD_NODENAME finds no cells in $cells_file: can it read this file?" >&2
     exit 1
 fi
 if [ ! -x "$program" ]; then
-    echo "perturb: $SLURMD_NODENAME finds no program $program: put it in a folder that all nodes see" >&2
+    echo "perturb: $SLURMD_NODENAME finds no program $program: put it in a folder that all nodes can read" >&2
     exit 1
 fi
 exec "$program" run {plan} --json --out {folder} --cell "$cells" --jobs {jobs} --group {group} --server-wait {wait} {servers}

@@ -454,7 +454,7 @@ fn a_machine_without_slurm_is_refused() {
     let fake = Fake::new();
     fake.slurm().check(&StopFlag::default()).unwrap();
     fake.command("scontrol", "echo 'MaxArraySize = 0'");
-    assert!(fake.run().unwrap_err().to_string().contains("takes no job arrays"));
+    assert!(fake.run().unwrap_err().to_string().contains("without job arrays"));
     fake.command("scontrol", "echo hello");
     assert!(fake.run().unwrap_err().to_string().contains("scontrol printed `hello`, expected a line MaxArraySize"));
 }
