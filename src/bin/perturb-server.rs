@@ -28,11 +28,11 @@ use tokio::{
 #[cfg(not(feature = "otel"))]
 use tracing_subscriber::{layer::SubscriberExt, util::SubscriberInitExt};
 
-/// The text of the protocol's file in the repository.
+/// The text of the file that defines the protocol.
 const CONTRACT: &str = include_str!("../../proto/perturb/v1/perturb.proto");
 
 fn main() -> ExitCode {
-    let _ = perturb_system::ignore_sigxfsz(); // if this fails, the only loss is that a file-size limit ends the program
+    let _ = perturb_system::ignore_sigxfsz(); // if this fails, a file-size limit can end the program
     let arguments = Arguments::parse();
     if let Some(page) = requested_text(&arguments) {
         // An error is ignored, because the reader may close the pipe early.
@@ -68,7 +68,7 @@ fn main() -> ExitCode {
         let lines = tracing_subscriber::fmt::layer()
             .with_writer(io::stderr)
             .with_ansi(io::IsTerminal::is_terminal(&io::stderr()))
-            .log_internal_errors(false); // they would also go to standard error; if that fails, the program would end
+            .log_internal_errors(false); // they are printed by `eprintln!`, which panics if standard error is closed
         tracing_subscriber::registry().with(lines).with(config.filter()).init();
     }
     #[cfg(feature = "otel")]
@@ -195,7 +195,8 @@ struct Environments {
     reports: Vec<String>,
 }
 
-/// Logs once for each folder if its files change. All sessions continue to use the files as they were loaded.
+/// Logs a warning when the files of a folder change, once for each folder. The server continues to use the files as
+/// they were when it loaded them.
 #[cfg(feature = "mujoco")]
 async fn watch_folders(mut folders: Vec<folder::TaskFolder>) {
     const FILES_CHECK_INTERVAL: std::time::Duration = std::time::Duration::from_secs(5);
@@ -229,7 +230,8 @@ fn check(config: &Config) -> Result<(), Failure> {
     environments(config, true).map(|_| ())
 }
 
-/// Loads a folder within limits of memory and CPU time, and prints its description. This process was started for that.
+/// Loads a folder within limits of memory and CPU time, and prints its description. Another `perturb-server` process
+/// started this process for that purpose.
 #[cfg(feature = "mujoco")]
 fn check_task(path: &std::path::Path, measured: bool) -> ExitCode {
     let report = folder::child::limit_this_process()
@@ -347,13 +349,13 @@ fn health(config: &Config) -> Result<(), Failure> {
     Ok(runtime.block_on(probe(listen, config.tls_cert.as_deref()))?)
 }
 
-/// Resolves at SIGTERM or SIGINT, or, if `exit_with_stdin`, when standard input closes. A second signal exits
-/// immediately.
+/// Returns a future that resolves at SIGTERM or SIGINT, or, if `exit_with_stdin`, when standard input closes. At the
+/// next SIGTERM or SIGINT after that, the program exits immediately.
 ///
 /// Batch systems and the kernel warn of a limit by SIGUSR1, SIGUSR2 or SIGXCPU. The first warning also resolves the
 /// future. The server then exits immediately only at the second SIGTERM or SIGINT after the warning. If
-/// `exit_with_stdin`, warnings are ignored: the program that started the server may get the same warning, and then
-/// needs the server to save its work.
+/// `exit_with_stdin`, warnings are ignored: the program that started the server may get the same warning, and still
+/// needs the server while it saves its own work.
 fn shutdown(exit_with_stdin: bool) -> io::Result<impl Future<Output = ()>> {
     let (mut terminate, mut interrupt) = (signal(SignalKind::terminate())?, signal(SignalKind::interrupt())?);
     let (mut user_1, mut user_2) = (signal(SignalKind::user_defined1())?, signal(SignalKind::user_defined2())?);

@@ -111,7 +111,7 @@ impl EmbeddedSession {
     }
 
     /// Returns a function that queues the next step in the pool while `request` runs, or `None` if the next step must
-    /// wait. After a call of the function, the next request to [`answer`](Self::answer) must be the step passed to it.
+    /// wait. If a step is passed to this function, the next call of [`answer`](Self::answer) must be for that step.
     pub fn pipeline(&self, request: &SessionRequest) -> Option<impl FnOnce(SessionRequest) + Send + use<>> {
         self.handler.pipeline(request)
     }

@@ -1,4 +1,4 @@
-//! Random names, of leases and worlds, that clients cannot guess.
+//! Random names for leases and worlds. Clients cannot guess these names.
 
 use super::error::{ErrorKind, RequestError};
 

@@ -23,16 +23,17 @@ pub struct Security {
     pub tls: Option<Tls>,
     /// The ledger of all draws.
     pub ledger: Option<Ledger>,
-    /// The watchers whose threads read the files again when these change.
+    /// The watchers of the token and TLS files. Their threads reload the files when they change.
     watches: Vec<FileWatcher>,
 }
 
 impl Security {
-    /// Loads the files that the configuration names, and watches them for changes. The token file may refer to the
-    /// environments of `catalogue`.
+    /// Loads the files that the configuration names, and watches the token and TLS files for changes. The token file
+    /// may refer to the environments of `catalogue`.
     ///
     /// # Errors
-    /// If a file cannot be read or is invalid. The message names the file and what was expected.
+    /// If a file cannot be read or is invalid, or a thread cannot be started. If a file is the cause, the message names
+    /// it and says what was expected.
     pub fn load(config: &Config, catalogue: &Catalogue) -> io::Result<Self> {
         let mut security = Self::default();
         if let Some(path) = &config.tokens {
@@ -48,7 +49,7 @@ impl Security {
         Ok(security)
     }
 
-    /// Returns a handle that has the token and TLS files read again immediately.
+    /// Returns a handle with which the token and TLS files can be reloaded immediately.
     pub fn reloader(&self) -> Reloader {
         Reloader::new(&self.watches)
     }

@@ -18,7 +18,8 @@ pub enum ShutdownPhase {
 #[derive(Clone)]
 pub struct Drain {
     phase: watch::Receiver<ShutdownPhase>,
-    /// Held by sessions only. When all receivers are dropped, no session runs.
+    /// A receiver of `sessions`, which only the handle of a session has. When all receivers are dropped, no session
+    /// runs.
     _session: Option<watch::Receiver<()>>,
     sessions: watch::Sender<()>,
 }
@@ -38,8 +39,8 @@ impl Controller {
         (Self { phases: vec![phase], sessions: sessions.clone() }, Drain { phase: view, _session: None, sessions })
     }
 
-    /// Makes a handle for another thread. Sessions read the phase at each request, and handles of different threads
-    /// share no lock.
+    /// Makes a handle for another thread. Sessions read the phase at each request. The handle shares no lock with the
+    /// handles of other threads, so the sessions of different threads do not wait for each other.
     pub fn view(&mut self) -> Drain {
         let (phase, view) = watch::channel(ShutdownPhase::Running);
         self.phases.push(phase);
@@ -73,7 +74,7 @@ impl Drain {
         self.reached(ShutdownPhase::Closed).await;
     }
 
-    /// Waits for [`ShutdownPhase::Draining`].
+    /// Waits for [`ShutdownPhase::Draining`] or a later phase.
     pub async fn draining(&mut self) {
         self.reached(ShutdownPhase::Draining).await;
     }

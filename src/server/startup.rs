@@ -54,10 +54,10 @@ use tonic_health::{
 };
 use tower::{Layer, ServiceBuilder};
 
-/// The HTTP/2 flow-control window of a stream, bytes: enough for one step's actions of ten thousand robots.
+/// The HTTP/2 flow-control window of a stream, bytes: enough for the actions of ten thousand robots in one step.
 const STREAM_WINDOW_BYTES: u32 = 1 << 20;
-/// The HTTP/2 flow-control window of a connection, bytes. Unread requests of 16 sessions fit in it before they block
-/// the connection's other sessions.
+/// The HTTP/2 flow-control window of a connection, bytes. It has room for the full windows of 16 streams, so the unread
+/// requests of fewer sessions cannot block the connection's other sessions.
 const CONNECTION_WINDOW_BYTES: u32 = 16 * STREAM_WINDOW_BYTES;
 /// The maximum number of streams of a connection in addition to its sessions: health checks, the catalogue, reflection.
 const MAX_OTHER_STREAMS: usize = 16;
@@ -71,7 +71,7 @@ const CONNECTION_CLOSE_TIMEOUT: Duration = Duration::from_secs(1);
 const SERVICES: [&str; 2] =
     [PerturbServer::<PerturbService>::NAME, EnvironmentServer::<dm_env_rpc::service::DmEnvRpcService>::NAME];
 
-/// Why the server stopped.
+/// Why the server could not start, or stopped without a shutdown.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -89,8 +89,8 @@ pub enum Error {
     Reflection(#[from] tonic_reflection::server::Error),
 }
 
-/// A boxed future. The code of the server's future is compiled in this library once, not in each program that calls
-/// [`run`].
+/// A boxed future. Functions that use it need no type parameters, so they are compiled once in this library, not in
+/// each program that calls [`run`].
 type BoxFuture<'a, T> = Pin<Box<dyn Future<Output = T> + 'a>>;
 
 /// Serves the environments of `catalogue` on `listeners`, and the metrics page on the listener `metrics` if there is
@@ -185,8 +185,8 @@ async fn serve(
     }
     shut_down(config, &controller, &health, &sources.requests, servers).await;
     if let Some(ledger) = &security.ledger {
-        // The ledger records the end of a session's draws when its environments are freed, so the ledger is closed
-        // after that.
+        // When a session's environments are freed, the ledger records the end of the session's draws. Therefore the
+        // ledger is closed only after all environments are freed, or after a timeout.
         if timeout(CONNECTION_CLOSE_TIMEOUT, parts.pool.freed()).await.is_err() {
             tracing::warn!("the ledger ends before all environments are freed");
         }
@@ -209,8 +209,8 @@ const FEATURES: &[&str] = &[
     "save_player",
 ];
 
-/// Returns the catalogue of a server with these settings as a message. Builds each environment once, so a model that
-/// cannot be loaded is found before the server starts.
+/// Returns, as a message, the catalogue that a server with these settings serves. Builds each environment once, so a
+/// model that cannot be loaded is found before the server starts.
 ///
 /// # Errors
 /// [`env::Error`], if an environment cannot be built.

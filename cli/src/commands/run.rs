@@ -1,6 +1,6 @@
 //! `perturb run`: runs the cells of an experiment in worker processes.
 
-use std::collections::HashSet;
+use std::collections::{HashMap, HashSet};
 use std::io::{BufRead, Read};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
@@ -152,7 +152,8 @@ fn all_cells(
     let local: Vec<Mutex<PrivateServer>> = local.into_iter().map(Mutex::new).collect();
     let (servers, errors) = Servers::connect_to_some(&addresses, stop)?;
     errors.iter().for_each(|error| say(format_args!("perturb: {error}; continuing with the other servers")));
-    let limits = step_limits(&servers, &plan)?.into_iter().map(|(name, limit)| (name.to_owned(), limit)).collect();
+    let limits = step_limits(&servers, &plan)?.into_iter().map(|(name, limit)| (name.to_owned(), limit));
+    let limits: HashMap<String, u32> = limits.collect();
     check_models(&servers, &plan, folder)?;
     let addresses: Vec<String> = addresses.iter().map(Address::to_string).collect();
     let command = |worker_index: usize| match local.len() {

@@ -28,9 +28,10 @@ _OPSET, _IR_VERSION = 17, 8
 
 @dataclass(frozen=True)
 class Network:
-    """The arrays of a policy network, in the order in which an observation passes them.
+    """The arrays of a policy network, in the order in which an observation passes through them.
 
-    An observation is normalised and passes hidden layers with tanh, an LSTM if there is one, and a linear output layer.
+    An observation is normalised. It then passes through hidden layers with tanh, an LSTM if there is one, and a linear
+    output layer.
     """
 
     # Observations x are normalised to clip((x - mean) / deviation, -bound, bound). The three arrays are float64 [O].

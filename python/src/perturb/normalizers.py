@@ -70,12 +70,13 @@ def _read(path: Path) -> Any:
 
 
 def _require_untouched(model: Any) -> None:
-    """Refuse a model that was trained with a VecNormalize and was loaded without it.
+    """Refuse a model that was, or may have been, trained with a VecNormalize, and was loaded without it.
 
-    stable-baselines3 stores the last observations of a model in `_last_obs`. In `_last_original_obs` it stores the last
-    observations before normalisation. On-policy algorithms set `_last_original_obs` only under a VecNormalize.
-    Off-policy algorithms always set it. Under a VecNormalize, their `_last_obs` is a scaled and shifted copy of
-    `_last_original_obs`. Without a VecNormalize, it has the observations of the step after `_last_original_obs`.
+    stable-baselines3 stores the last observations of a model in `_last_obs`. Under a VecNormalize these are normalised,
+    and `_last_original_obs` has the same observations before normalisation. Without a VecNormalize, on-policy
+    algorithms do not set `_last_original_obs`, and off-policy algorithms store the observations of the previous step in
+    it. So in an off-policy model, `_last_obs` is a scaled and shifted copy of `_last_original_obs` only under a
+    VecNormalize.
     """
     original, last = getattr(model, "_last_original_obs", None), getattr(model, "_last_obs", None)
     if original is None:

@@ -255,7 +255,7 @@ class Session:
             raise self._failed(kind, error) from None
 
     def _failed(self, kind: str, error: BaseException) -> BaseException:
-        """Return the error to raise in place of an error of the native module. Most errors end the session.
+        """Return the error to raise in place of one of the native module. Close a session that is no longer usable.
 
         `kind` is the kind of request, such as `step`.
         """

@@ -20,8 +20,7 @@ use std::sync::{
     atomic::{AtomicU32, Ordering},
 };
 
-/// The auditor of the draws of parameters of one session, or of one world of dm_env_rpc. It checks the draws and
-/// records them.
+/// Checks and records the draws of parameters in one session of `perturb.v1` or one world of dm_env_rpc.
 #[derive(Clone)]
 pub struct DrawAuditor {
     bearer: Option<Bearer>,
@@ -71,7 +70,8 @@ impl DrawAuditor {
     /// Checks and records the draws of environments that a session is about to create.
     ///
     /// # Errors
-    /// [`Error::NotAllowed`] if the role forbids a draw, [`Error::NoLedger`] if the ledger cannot be written.
+    /// [`Error::NotAllowed`] if the role forbids a draw, [`Error::NoLedger`] if the ledger cannot be written,
+    /// [`Error::Value`] if the ledger's line would be too long.
     pub async fn open(&self, settings: &BatchSettings) -> Result<PendingDraws, Error> {
         if self.is_exempt() {
             return Ok(PendingDraws::default());
@@ -186,7 +186,7 @@ impl DrawAuditor {
         Err(Error::NotAllowed { role: role.name().into(), environment: spec.name, region: region.to_string(), reason })
     }
 
-    /// Charges the token for a ledger line of this length, in steps, so the token's rate also limits the growth of the
+    /// Charges the token for a ledger line of `bytes` bytes, so that the token's rate also limits the growth of the
     /// ledger.
     fn charge_line(&self, bytes: usize) {
         if let Some(bearer) = &self.bearer {
@@ -205,7 +205,8 @@ impl DrawAuditor {
     }
 
     /// Checks draws that are about to begin, and records them, with the draws that they replace (`ends`), in one ledger
-    /// line. Each item of `begins` is the draw of the first of several successive environments, and their number.
+    /// line. Each item of `begins` stands for one or more successive environments: the draw of the first one, and their
+    /// number.
     async fn begin<'a>(
         &self,
         spec: &EnvironmentSpec,
@@ -252,7 +253,8 @@ impl DrawAuditor {
     }
 }
 
-/// Groups successive environments that begin equal draws. Returns the regions that they draw from, and the groups.
+/// Groups successive environments that begin draws of the same seed, region and episode. Returns the regions and the
+/// groups. A group refers to its region by index.
 fn group_begins<'a>(
     spec: &EnvironmentSpec,
     begins: impl Iterator<Item = (NextDraw<'a>, usize)>,

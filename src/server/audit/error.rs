@@ -25,7 +25,7 @@ pub enum Error {
         role: String,
         /// The name of the environment.
         environment: &'static str,
-        /// The region of the parameter space that the draw was from.
+        /// The region of the parameter space from which the draw was requested.
         region: String,
         /// The reason, as a part of a sentence.
         reason: String,

@@ -22,10 +22,11 @@ use std::{
 };
 use tokio::sync::oneshot;
 
-/// The interval at which the file is checked while nothing is written.
+/// The interval at which the ledger file is checked while nothing is written.
 const CHECK_INTERVAL: Duration = Duration::from_secs(1);
 
-/// An event to be written, and the channel that reports that it is on the disk.
+/// An event to be written. If a caller waits for the result, also the channel for reporting success or the reason of a
+/// failure.
 type WriteRequest = (LedgerEvent, Option<oneshot::Sender<Result<(), String>>>);
 
 /// A handle to the server's ledger, which is written by a thread of its own.
@@ -60,7 +61,8 @@ impl Ledger {
     /// ledger.
     ///
     /// # Errors
-    /// If the file is not a valid ledger, another server is writing it, or it cannot be written.
+    /// If the file is not a valid ledger, another server is writing it, it cannot be read or written, or the writer
+    /// thread cannot be started.
     pub fn open(path: &Path) -> io::Result<Self> {
         if path.metadata().is_ok_and(|metadata| !metadata.is_file()) {
             return Err(io::Error::other(
@@ -148,7 +150,7 @@ impl Ledger {
         let _ = self.lines.send((event, None));
     }
 
-    /// Writes that the server ends, after all queued events.
+    /// Writes all queued events, then the event that the server has ended.
     pub async fn close(&self) {
         if let Err(error) = self.write(LedgerEvent::Ended).await {
             tracing::error!("{error}");
@@ -160,7 +162,7 @@ impl Ledger {
 pub fn line_bytes(event: &LedgerEvent) -> usize {
     /// An upper bound of the length of the line's digest, number, time and line end.
     const FRAME_BYTES: usize = 128;
-    // The writer thread reports an event that cannot be written as JSON.
+    // An event that cannot be converted to JSON counts as 0 bytes here. The writer thread reports the error.
     serde_json::to_vec(event).map_or(0, |json| json.len()) + FRAME_BYTES
 }
 
@@ -233,7 +235,8 @@ impl LedgerWriter {
         found
     }
 
-    /// Compares the open file with the file at the path, and its length with the bytes that were written.
+    /// Checks that the open file is still the file at the path, and that the file's length is the number of bytes that
+    /// were written.
     fn file_is_intact(&self) -> Result<(), String> {
         let own = self.file.metadata().map_err(|error| error.to_string())?;
         match self.path.metadata() {

@@ -2,7 +2,7 @@
 
 use crate::server::error::{ErrorKind, RequestError};
 
-/// Why a call was rejected because of its token, or a request because of the token's limits.
+/// Why a token was rejected, or why a request exceeds the limits of its token.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {

@@ -1,4 +1,4 @@
-//! Watches files of tokens and certificates, and has them reloaded when they change.
+//! Watches the token and TLS files, and reloads them when they change.
 
 use perturb_system::{explain_no_thread, read_plain};
 use std::{
@@ -52,10 +52,10 @@ pub fn read(paths: &[PathBuf]) -> Contents {
 }
 
 impl FileWatcher {
-    /// Starts a thread that calls `reload` with the contents of the files whenever these differ from the last contents,
-    /// at first `before`. New contents count only when two successive readings are equal, because another program may
-    /// still be writing. A [`Reloader`] skips this check. Errors are logged, and watching continues. `what` names the
-    /// files in the log.
+    /// Starts a thread that calls `reload` with the contents of the files after each change. `before` has the contents
+    /// that are already loaded. New contents count only when two successive readings are equal, because another program
+    /// may still be writing. A [`Reloader`] skips this check. Errors are logged, and watching continues. `what` names
+    /// the files in the log.
     ///
     /// # Errors
     /// If the operating system cannot start a thread.

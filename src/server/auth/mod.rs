@@ -1,4 +1,5 @@
-//! Authentication: tokens from a file, each with its name, digest, quotas and role, and the layer that checks them.
+//! Authentication: the tokens of the token file, with their names, digests, quotas and roles. A layer checks the token
+//! of each call.
 
 mod error;
 pub mod file_watcher;
@@ -40,7 +41,7 @@ pub struct Token {
     revoked: AtomicBool,
     /// Wakes the tasks that wait in [`Token::revoked`].
     revoked_notify: Notify,
-    /// The quotas of the token's name. A token that replaces another one of the same name shares them.
+    /// The quotas, which belong to the token's name: a token that replaces another token of the same name shares them.
     quotas: Arc<Quotas>,
 }
 
@@ -82,8 +83,8 @@ impl Token {
         &self.name
     }
 
-    /// Charges steps to the rate limit after they ran, because their number is unknown before. `price` is the price of
-    /// other work, in steps.
+    /// Counts steps, and charges them to the rate limit. Call it after the steps ran, because their number is not known
+    /// earlier. `price` is the price of other work, in steps; it is charged but not counted.
     pub fn charge(&self, steps: u64, price: u64) {
         self.quotas.steps.fetch_add(steps, Ordering::Relaxed);
         self.quotas.rate_limiter.charge(steps + price);
@@ -120,7 +121,7 @@ impl Token {
         self.acquire_within(MAX_WAIT).await
     }
 
-    /// Waits until the token's rate has allowed all steps that the token was charged for.
+    /// Waits until the token's rate has allowed all steps that were charged before this call.
     ///
     /// # Errors
     /// [`Error::TooFast`], as soon as it is known that the wait would be longer than `max_wait`.
@@ -211,8 +212,8 @@ impl Tokens {
         self.good.read().unwrap_or_else(PoisonError::into_inner).iter().map(|token| token.usage()).collect()
     }
 
-    /// Replaces the tokens by those of a new text of the token file. A token whose name, digest and role are unchanged
-    /// keeps its sessions; all other old tokens are revoked.
+    /// Replaces the tokens with the tokens in `text`, the new contents of the token file. A token whose name, digest
+    /// and role are unchanged keeps its sessions; all other old tokens are revoked.
     ///
     /// # Errors
     /// [`TokenFileError`], if the text is invalid; the tokens are unchanged then.

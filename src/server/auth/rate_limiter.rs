@@ -102,7 +102,8 @@ impl RateState {
     }
 
     /// Returns how long to sleep before calling again, or `None` if the caller may proceed. `ticket` must be `None` at
-    /// the first call. That call stores the number of steps to wait for in `ticket`.
+    /// the first call, which sets it to the number of steps charged so far. The wait ends when the rate has allowed
+    /// these steps.
     fn wait(
         &mut self,
         ticket: &mut Option<f64>,
@@ -196,7 +197,7 @@ mod tests {
                 }
             }
             clocked.now = *at;
-            // Sessions that call at the same time proceed in any order.
+            // Sessions that call at the same time proceed in any order, so the numbers may differ by 2.
             let turns = sessions.map(|session| session.2);
             assert!(turns.iter().max().unwrap() - turns.iter().min().unwrap() <= 2, "{turns:?}");
         }

@@ -208,7 +208,7 @@ fn digest(entry: &TokenEntry) -> Result<[u8; 32], String> {
     }
 }
 
-/// Makes a new token of 256 random bits. Returns the token, and the entry of the token file with its digest.
+/// Makes a new token of 256 random bits. Returns the token, and an entry for the token file with the token's digest.
 ///
 /// # Errors
 /// If `name` is not a valid name, or the operating system has no random bits.

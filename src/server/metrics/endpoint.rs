@@ -100,7 +100,7 @@ fn answer(request: &Request<Incoming>, sources: &Arc<MetricsSources>) -> Respons
     response
 }
 
-/// Joins the values of all `Accept` headers of a request. Returns `None` if it has none.
+/// Joins the values of all `Accept` headers of a request. Returns `None` if the request has no such header.
 fn accept(request: &Request<Incoming>) -> Option<String> {
     let values: Vec<_> = request.headers().get_all(ACCEPT).iter().filter_map(|value| value.to_str().ok()).collect();
     (!values.is_empty()).then(|| values.join(","))

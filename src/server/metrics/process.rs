@@ -6,7 +6,7 @@ use rustix::{
 };
 use std::{fs, io};
 
-/// The resources that this process uses. The selection is the standard one of Prometheus' client libraries.
+/// The resources that this process uses. They are among the standard process metrics of Prometheus' client libraries.
 pub struct Resources {
     /// The CPU time used so far, s.
     pub cpu_seconds: f64,
@@ -29,7 +29,7 @@ pub struct Resources {
 pub fn resources() -> io::Result<Resources> {
     let stat = fs::read_to_string("/proc/self/stat")?;
     let system = fs::read_to_string("/proc/stat")?;
-    // The descriptor of this directory itself is not counted.
+    // The descriptor through which this line reads the directory is not counted.
     let descriptors = fs::read_dir("/proc/self/fd")?.count().saturating_sub(1);
     parse(&stat, &system, descriptors)
         .ok_or_else(|| io::Error::new(io::ErrorKind::InvalidData, "/proc/self/stat or /proc/stat has another format"))

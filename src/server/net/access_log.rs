@@ -18,10 +18,10 @@ const WINDOW: Duration = Duration::from_secs(1);
 pub const GONE: &str = "gone";
 /// Logged ending of a session that its client closed.
 pub const CLOSED: &str = "closed";
-/// Logged ending of a session whose stream broke: its bytes cannot be decoded, the connection failed, or the server has
-/// a defect.
+/// Logged ending of a session whose stream broke, because its bytes could not be decoded, the connection failed, or the
+/// server has a defect.
 pub const BROKEN: &str = "broken";
-/// Logged ending of a session whose lease expired. Endings other than these four are words of error classes
+/// Logged ending of a session whose lease expired. Any ending other than these four is the word of an error class
 /// ([`ErrorKind::reason`](crate::server::error::ErrorKind::reason)).
 pub const LEASE_OVER: &str = "lease_over";
 
@@ -67,7 +67,7 @@ struct LogState {
 }
 
 impl AccessLog {
-    /// Makes [`endings`](Self::endings) list this protocol with counts of 0 before its first session ends.
+    /// Adds counts of 0 for this protocol, so that [`endings`](Self::endings) includes them before a session ends.
     pub fn register_protocol(&self, protocol: &'static str) {
         let mut state = self.lock();
         for ending in [GONE, CLOSED, BROKEN, LEASE_OVER] {
@@ -107,7 +107,8 @@ impl AccessLog {
         *state.endings.entry((protocol, ending)).or_default() += 1;
         let now = Instant::now();
         let (since, n_ended) = state.window.get_or_insert((now, 0));
-        // A window that exceeds the maximum is ended by the task below, which logs how many sessions were omitted.
+        // Once more sessions than the maximum have ended in a window, the task below ends the window. That task logs
+        // how many sessions were omitted.
         if *n_ended <= MAX_LINES_PER_WINDOW && since.elapsed() >= WINDOW {
             (*since, *n_ended) = (now, 0);
         }

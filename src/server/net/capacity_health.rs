@@ -4,8 +4,8 @@ use super::peer_limiter::PeerLimiter;
 use crate::pool::Pool;
 use tonic_health::{ServingStatus, server::HealthReporter};
 
-/// The service name whose health is NOT_SERVING while all sessions or all environments are in use, and during a
-/// shutdown.
+/// The service name whose health is NOT_SERVING while the number of sessions or of environments is at its limit, and
+/// during a shutdown.
 pub const NEW_SESSIONS: &str = "perturb.v1.Perturb.NewSessions";
 
 /// Keeps the health status of [`NEW_SESSIONS`] up to date. Never returns.

@@ -24,7 +24,7 @@ pub struct Accepted {
     pub peer: Peer,
     /// The permit for the connection.
     pub permit: PeerPermit,
-    /// The counter of the connection's work, which is added to the load of its thread.
+    /// The counter that adds the connection's work to the load of its thread.
     pub load: ConnectionLoad,
 }
 
@@ -47,7 +47,8 @@ pub type ServedConnection = ManagedIo<Box<dyn ByteStream>>;
 /// Settings for the handshakes of a transport thread's connections.
 #[derive(Clone)]
 pub struct Handshakes {
-    /// The maximum time for the TLS handshake, and again for the start of HTTP/2.
+    /// The maximum time for the TLS handshake. After the handshake, the client's HTTP/2 preface must arrive within the
+    /// same time.
     pub limit: Duration,
     /// The TLS settings for TCP connections; `None` for connections without TLS.
     pub tls: Option<Tls>,

@@ -10,7 +10,7 @@ use std::{
 };
 use tokio::net::{TcpListener, UnixListener, UnixSocket, UnixStream};
 
-/// The length of the operating system's queue of connections that the server has not accepted yet.
+/// The maximum number of connections to a Unix socket that the operating system queues until the server accepts them.
 const MAX_PENDING_CONNECTIONS: u32 = 1024;
 
 /// A socket that listens at an address.
@@ -21,7 +21,8 @@ pub enum Listener {
     Unix(UnixListener, SocketFile),
 }
 
-/// Explains why an address cannot be bound, and what to do about `flag`, the option of the command line that gave it.
+/// Explains why `address` cannot be bound, and suggests a remedy. `flag` is the command-line option that gave the
+/// address.
 fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     let text = address.written();
     match (address, error.kind()) {
@@ -88,8 +89,8 @@ impl Listener {
             ListenAddress::Unix(path) => {
                 let is_socket = std::fs::symlink_metadata(path).is_ok_and(|m| m.file_type().is_socket());
                 let refused = |e: io::Error| e.kind() == ErrorKind::ConnectionRefused;
-                // Only a refused connection shows that the server is dead: a server that does not accept still owns the
-                // address.
+                // Only a refused connection shows that the server is dead. Other errors may come from a running server,
+                // for instance if its queue of connections is full.
                 if is_socket && UnixStream::connect(path).await.is_err_and(refused) {
                     std::fs::remove_file(path).map_err(explain)?;
                 }

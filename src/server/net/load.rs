@@ -9,17 +9,17 @@ use std::{
 };
 use tokio::time::Instant;
 
-/// The time constant with which past work is forgotten. This time is as long as a learner may compute between two
-/// batches of steps, so that the thread of a computing learner does not look idle.
+/// The time constant with which the weight of past work decays. Learners may compute for this long between two batches
+/// of steps. With a shorter time constant, their threads would look idle meanwhile.
 const WINDOW: Duration = Duration::from_secs(10);
 /// The number of bytes that cost as much work as a read or write itself.
 const BYTES_PER_UNIT: usize = 16 << 10;
-/// The minimum work that is expected of a new connection, in units: its handshake.
+/// The minimum work that is expected of a new connection, in units: the work of its handshake.
 const HANDSHAKE_WORK: f64 = 16.0;
 
 /// The work of one transport thread, written by that thread only, and its number of connections. A read or write that
-/// moved data counts as one unit of work, and one more for each 16 KiB. Steps that run on the thread itself, for up to
-/// 80 µs each, are not counted. CPU time would be a wrong measure, because sessions spin while they wait.
+/// moved data counts as one unit of work, plus one unit for each full 16 KiB. Steps that run on the thread itself, for
+/// up to 80 µs each, are not counted. CPU time would be a wrong measure, because sessions spin while they wait.
 #[derive(Default)]
 pub struct ThreadLoad {
     work: AtomicU64,
@@ -95,7 +95,8 @@ impl Balance {
 
     /// Chooses the thread with the least recent work, and among equal threads the thread with the fewest connections.
     /// Returns the index of the thread, and the counter of the new connection's work. The thread's recent work
-    /// immediately rises by the average of a connection, so simultaneous connections are spread over the threads.
+    /// immediately rises by the average work of a connection, or by `HANDSHAKE_WORK` if that is more. Simultaneous
+    /// connections are therefore spread over the threads.
     pub fn choose(&mut self, now: Instant) -> (usize, ConnectionLoad) {
         self.refresh(now);
         let connections: usize = self.threads.iter().map(|thread| thread.load.connections()).sum();
@@ -147,7 +148,7 @@ mod tests {
             thread
         }
 
-        /// Advances the clock. Each connection does `units` of work per second, as a function of its number.
+        /// Advances the clock by `seconds`. In each second, connection number `i` does `units(i)` units of work.
         fn work(&mut self, seconds: u64, units: impl Fn(usize) -> usize) {
             for (place, (_, connection)) in self.connections.iter().enumerate() {
                 (0..units(place) * seconds as usize).for_each(|_| connection.count(1));

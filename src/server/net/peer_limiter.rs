@@ -11,7 +11,7 @@ use tokio::sync::Notify;
 /// The other end of a connection, to which limits apply.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum Peer {
-    /// The machine with this IPv4 address, or the IPv6 network that one machine may own.
+    /// A machine, identified by its IPv4 address or its IPv6 network.
     Machine(IpAddr),
     /// The user ID of a client that connected over a Unix socket; `None` if the operating system does not report it.
     User(Option<u32>),
@@ -50,7 +50,7 @@ struct PermitCounts {
     changed: Notify,
 }
 
-/// The limit that prevents another permit, with its value.
+/// The limit because of which no further permit is available, with the limit's value.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum LimitReached {
     /// The limit on all peers together.

@@ -1,4 +1,4 @@
-//! Checks the health of a running server. Container engines run the server program with an option for this.
+//! Checks the health of a running server. Container engines run the server program with the option `--health` for this.
 
 use crate::config::ListenAddress;
 use perturb_protocol::{Address, AddressError, ClientError, Connection, Timeouts, credentials::Credentials};
@@ -16,7 +16,7 @@ const PROBE_TIMEOUT: Duration = Duration::from_secs(3);
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
-    /// No client can connect to the address at which the server listens.
+    /// Clients cannot use the address of the listener, e.g. because its port is 0.
     #[error(transparent)]
     Address(#[from] AddressError),
     /// The path of the Unix socket is relative, and the working directory no longer exists.
@@ -33,8 +33,8 @@ pub enum Error {
 }
 
 /// Checks that the server that listens at `listen` accepts sessions. If `listen` is the address of all interfaces,
-/// connects over the loopback interface. If `certificate` is given, uses TLS and requires the server to show exactly
-/// this certificate, for any host name.
+/// connects over the loopback interface. If `certificate` is given, uses TLS for TCP addresses, and requires the server
+/// to show exactly this certificate. The certificate may be for any host name.
 ///
 /// # Errors
 /// [`Error`], if the check fails; after at most 3 s.

@@ -21,7 +21,7 @@ use tokio_rustls::{
     server::TlsStream,
 };
 
-/// Builds the TLS settings from the contents of the files, which are in the order of [`TlsFiles::paths`].
+/// Builds the TLS settings. `contents` has the contents of the files, in the order of [`TlsFiles::paths`].
 fn build_config(files: &TlsFiles, contents: &[Vec<u8>]) -> Result<ServerConfig, String> {
     let [cert, key, rest @ ..] = contents else { return Err("a certificate and a key are expected".into()) };
     let chain = certificates(&files.cert, cert)?;
@@ -89,8 +89,9 @@ impl Tls {
         Ok(())
     }
 
-    /// Does the TLS handshake with a client. If it fails, sends the alert, and then reads until the client closes the
-    /// connection. If the connection were closed while data is unread, TCP would reset it, and the alert could be lost.
+    /// Does the TLS handshake with a client. If the handshake fails, sends the TLS alert, and then reads until the
+    /// client closes the connection. If the server closed the connection while data is unread, TCP would reset the
+    /// connection, and the alert could be lost.
     ///
     /// # Errors
     /// If the TLS handshake fails.

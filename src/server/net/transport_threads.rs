@@ -34,7 +34,7 @@ pub struct TransportThreads {
 }
 
 impl TransportThreads {
-    /// Makes the channels to the threads of `balance`. Returns for each thread the receiver of its connections.
+    /// Makes a handle with a channel to each thread of `balance`. Also returns the receiving end of each channel.
     pub fn new(balance: Balance) -> (Self, Vec<mpsc::UnboundedReceiver<Accepted>>) {
         let (threads, connections): (Vec<_>, _) = (0..balance.threads()).map(|_| mpsc::unbounded_channel()).unzip();
         (Self { threads: threads.into(), balance: Arc::new(Mutex::new(balance)) }, connections)
@@ -48,8 +48,8 @@ impl TransportThreads {
     }
 }
 
-/// Accepts connections and passes them to the transport threads. Never returns. When the future is dropped, a Unix
-/// socket's file is removed.
+/// Accepts connections and passes them to the transport threads. Never returns. If `listener` is a Unix socket, the
+/// socket's file is removed when the future is dropped.
 pub async fn accept(listener: Listener, limiter: PeerLimiter, threads: TransportThreads) -> Infallible {
     loop {
         match listener.accept().await {

@@ -35,13 +35,14 @@ pub struct SessionLimits {
     pub bytes: usize,
     /// The time within which the client must open the session.
     pub handshake: Duration,
-    /// The maximum time between the requests of an open session; `None` for no limit.
+    /// The maximum time that an open session waits for its next request; `None` for no limit. A limit shorter than
+    /// `handshake` also replaces `handshake`.
     pub idle: Option<Duration>,
 }
 
 impl Sessions {
-    /// Makes the admission of sessions by `limiter`. Errors are counted in `counters`, and ended sessions are logged in
-    /// `access`.
+    /// Makes the admission of sessions. `limiter` limits their number, in total and for each peer. Errors are counted
+    /// in `counters`, and ended sessions are logged in `access`.
     pub fn new(
         limiter: PeerLimiter,
         limits: SessionLimits,
@@ -76,7 +77,8 @@ impl Sessions {
         Self { drain: self.drain.enter(), ..self.clone() }
     }
 
-    /// Admits a stream above the session limits, for resuming only: a leased session already holds a permit.
+    /// Admits a stream above the session limits, for resuming only: the leased session that the stream resumes already
+    /// holds a permit.
     fn admit_to_resume(&self, refusal: Error) -> Result<Admission, Error> {
         let is_full = matches!(
             refusal,
@@ -88,7 +90,7 @@ impl Sessions {
         }
     }
 
-    /// Counts an error, also for the stream's token if there is one.
+    /// Counts an error of the server. If the stream has a token, also counts the error for this token.
     pub(super) fn count(&self, error: &impl RequestError, bearer: Option<&Bearer>) {
         self.counters.count(error.kind());
         if let Some(bearer) = bearer {

@@ -1,6 +1,6 @@
 //! The task that runs a session. A session without a lease ends with its stream. A session with a lease outlives its
-//! stream for a while, and another stream may attach to it. A request that was being answered when the stream was lost
-//! is completed, and the last replies are stored for sending them again.
+//! stream for a while, and another stream may attach to it. If such a session loses its stream while it answers a
+//! request, it completes the request. It stores its last replies, so that it can send them again.
 
 use super::{
     Error,
@@ -46,7 +46,8 @@ const REPLY_OVERHEAD_BYTES: usize = 512;
 pub type Responses<R> = Pin<Box<dyn Stream<Item = Result<R, Status>> + Send>>;
 
 impl Sessions {
-    /// Starts a session in a new task, in which `handler` answers the requests of the stream. Returns the responses.
+    /// Starts a session in a new task. There `handler` answers the requests that `requests` reads from the session's
+    /// stream. Returns the responses.
     ///
     /// # Errors
     /// A status, if the server is shutting down or full, or the quota of the stream's token is used up.
@@ -85,7 +86,8 @@ struct SessionDriver<H: SessionHandler> {
 struct ActiveLease<R> {
     grant: LeaseGuard<R>,
     stored: ReplayBuffer<StoredReply<R>>,
-    /// The number of the last reply that was sent on the current stream.
+    /// The number of the last reply that was sent on the current stream, or that the client had received before it
+    /// resumed the session on this stream.
     sent: u64,
 }
 
@@ -217,7 +219,7 @@ impl<H: SessionHandler> SessionDriver<H> {
         let resumed = match handover {
             Some(StreamHandover::Lease(grant)) => {
                 // After the loss of a stream, a client with a lease resends its unanswered requests. So no request may
-                // be read ahead of its turn.
+                // be read before the previous request is answered.
                 self.exchange.reads_ahead = false;
                 self.lease = Some(ActiveLease { stored: ReplayBuffer::new(grant.max_unanswered), grant, sent: 0 });
                 None
@@ -326,7 +328,8 @@ impl<H: SessionHandler> SessionDriver<H> {
         Attachment::Detached(resuming)
     }
 
-    /// Handles a stream that cannot continue. A session with a lease ends only if the server itself stops it.
+    /// Handles a stream that cannot continue. A session with a lease ends only if the server itself stops the stream
+    /// ([`StreamStop::Refused`]).
     fn on_stop(
         &mut self,
         responses: &ResponseSender<H::Response>,
@@ -348,14 +351,14 @@ impl<H: SessionHandler> SessionDriver<H> {
     }
 
     /// Stores a reply for sending. If the stream is lost, the reply can be sent again on another stream. If the memory
-    /// budget is exhausted, drops the older stored replies.
+    /// budget is exhausted, or the stored replies are longer than [`MAX_STORED_BYTES`], drops the older ones.
     fn store_reply(&mut self, answer: Result<Reply<H::Response>, H::Error>) {
         let Self { exchange, lease: Some(lease) } = self else { return };
         let stored = &mut lease.stored;
         let needs_memory =
             |kind| matches!(kind, ErrorKind::MemoryFull | ErrorKind::TokenQuota | ErrorKind::MoreThanTokenQuota);
         if answer.as_ref().is_err_and(|error| needs_memory(error.kind())) {
-            stored.clear(); // they were all sent, and they take memory that the request needs
+            stored.clear(); // all were sent, and the client's next attempt needs their memory
         }
         let Reply { response, memory: outgoing, .. } = exchange.finish(answer);
         let (budget, bytes) = (exchange.requests.budget().clone(), response.encoded_len() + REPLY_OVERHEAD_BYTES);
@@ -383,10 +386,10 @@ impl<R: Clone> ActiveLease<R> {
     }
 
     /// Answers a stream's request to resume the session. Returns the channel through which the stream will arrive, or
-    /// `None` if the request is refused.
+    /// `None` if the request is refused or the stream is already lost.
     fn accept_resume(&mut self, ResumeRequest { last_reply, answer }: ResumeRequest<R>) -> Option<Resuming<R>> {
         if let Err(error) = self.stored.check(last_reply) {
-            let _ = answer.send(Err(error)); // fails if the stream has been lost, too
+            let _ = answer.send(Err(error)); // fails if the new stream has been lost, too
             return None;
         }
         let (arrival, resuming) = oneshot::channel();
@@ -404,7 +407,7 @@ fn end_stream<R: Send + 'static>(responses: &ResponseSender<R>, status: Status) 
     }
 }
 
-/// Waits for a stream's request to resume the session. Without a lease it never resolves.
+/// Waits for a stream's request to resume the session. Never resolves if there is no lease.
 async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<R> {
     if let Some(lease) = lease
         && let Some(resume) = lease.grant.resume_requests.recv().await
@@ -414,7 +417,7 @@ async fn resume_request<R>(lease: &mut Option<ActiveLease<R>>) -> ResumeRequest<
     std::future::pending().await
 }
 
-/// Waits for the stream whose resume request was accepted. Without such a stream it never resolves.
+/// Waits for the stream whose resume request was accepted. Never resolves if there is no such stream.
 async fn arrival<R>(resuming: &mut Option<Resuming<R>>) -> Result<ResumingStream<R>, oneshot::error::RecvError> {
     match resuming {
         Some(resuming) => resuming.await,

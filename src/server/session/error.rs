@@ -1,4 +1,4 @@
-//! Reasons for not admitting a session's stream, or for ending it.
+//! Reasons for not admitting a session's stream, for ending the stream, or for refusing one of its requests.
 
 use super::lease;
 use crate::server::{
@@ -8,7 +8,7 @@ use crate::server::{
     transport,
 };
 
-/// An error of a session: its own, or an error of a layer below.
+/// An error of the session layer, or of a layer below it.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {

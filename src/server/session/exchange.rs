@@ -22,10 +22,11 @@ use std::{convert::Infallible, sync::Arc, time::Duration};
 use tokio::time::{Instant, timeout};
 use tonic::Status;
 
-/// The ending of a session that existed only until its stream resumed another session. The access log omits it.
+/// The ending of a session that existed only until its stream resumed another session. The access log omits such
+/// sessions.
 pub(super) const MOVED: &str = "moved";
 
-/// The maximum time to wait for a session's environments to be freed before the end of its stream is sent.
+/// The maximum time for which the end of a stream is delayed until the environments of its session are freed.
 const MAX_CLOSE_TIME: Duration = Duration::from_secs(10);
 /// The charge for a request that is refused before it is decoded, in steps.
 const UNDECODED_PRICE: u64 = 1;
@@ -46,8 +47,8 @@ pub(super) struct Exchange<H: SessionHandler> {
     start: Instant,
     /// Whether the session was open when it began to wait for the current request.
     was_open: bool,
-    /// The last time at which the session was known to be open. The handshake timeout counts from here, so refused
-    /// requests do not extend it.
+    /// The last time at which the session was known to be open; at first the session's start. The handshake timeout
+    /// counts from this time, so a refused request does not extend the timeout.
     known_open: Instant,
     /// The steps of the session for which its token has been charged so far.
     charged: u64,
@@ -190,7 +191,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Waits until the token may make another request within its rate. Returns at once if the token has no rate.
+    /// Waits until the token's rate allows another request. Returns at once if there is no token or the token has no
+    /// rate.
     async fn pace(&mut self, bearer: Option<&Bearer>) -> Result<Result<(), auth::Error>, StreamStop<H::Error>> {
         tokio::select! {
             biased;
@@ -209,8 +211,8 @@ impl<H: SessionHandler> Exchange<H> {
         }
     }
 
-    /// Completes a request: charges the token. If the answer is an error, counts it and converts it to an in-band
-    /// reply.
+    /// Charges the token for an answered request, and returns the reply. If the answer is an error, counts the error
+    /// and converts it to an in-band reply.
     pub(super) fn finish(&mut self, answer: Result<Reply<H::Response>, H::Error>) -> Reply<H::Response> {
         self.charge();
         if self.was_open || self.handler.is_open() {
@@ -288,8 +290,8 @@ impl<H: SessionHandler> Drop for Exchange<H> {
     }
 }
 
-/// Reads the next request while the current one is being answered, and offers it to the pool. Never resolves, so the
-/// surrounding `select!` ends only with the answer.
+/// Reads the next request while the current one is being answered, and offers it to the pool. Never resolves, so this
+/// branch never ends the surrounding `select!`.
 async fn read_ahead<H: SessionHandler>(
     requests: &mut MessageReader,
     ahead: &mut Option<Result<Option<Message>, StreamStop>>,

@@ -1,4 +1,4 @@
-//! The trait through which the session driver has a protocol answer its requests.
+//! The trait by which a protocol answers the requests of a session.
 
 use super::{
     Error,
@@ -14,7 +14,7 @@ use std::future::Future;
 
 /// The effect of a response on the stream on which it is sent.
 pub enum StreamHandover<R> {
-    /// Grants the session a lease, so it may outlive the stream.
+    /// Grants the session a lease, so the session may outlive the stream.
     Lease(LeaseGuard<R>),
     /// Moves the stream to the session that it resumes.
     Resume(ResumeAccepted<R>),
@@ -24,10 +24,10 @@ pub enum StreamHandover<R> {
 pub struct Reply<R> {
     /// The response.
     pub response: R,
-    /// The memory reservation for the response, held until it is sent. `None` if memory that the session reserved when
-    /// it was opened covers it.
+    /// The memory reservation for the response, held until it is sent. `None` if the response needs no reservation of
+    /// its own, e.g. because the session reserved memory for it when the session was opened.
     pub memory: Option<MemoryReservation>,
-    /// The effect of the response on its stream, if it has one.
+    /// The effect of the response on its stream, if any.
     pub handover: Option<StreamHandover<R>>,
 }
 
@@ -44,7 +44,8 @@ pub trait SessionHandler: Send + 'static {
     type Request: prost::Message + Default + 'static;
     /// The type of the server's messages.
     type Response: prost::Message + Clone + 'static;
-    /// The reason for refusing a request, by the handler or before the request reaches it.
+    /// The error with which the handler refuses a request, or with which the session layer refuses it before the
+    /// handler gets it.
     type Error: RequestError + From<Error> + Send;
     /// The fields of a request whose entries are counted, and limited, before the request is decoded.
     const FIELDS: &'static [Field];
@@ -67,8 +68,8 @@ pub trait SessionHandler: Send + 'static {
     /// Returns the session's environment, its number of environments, and its steps so far.
     fn stats(&self) -> SessionStats;
 
-    /// The price of a request, in steps of one environment, in addition to the steps that the request runs. A token's
-    /// rate limits the sum of price and steps.
+    /// The price of a request, in steps of one environment. The steps that the request runs are charged in addition. A
+    /// token's rate limits the sum of price and steps.
     fn price(&self, request: &Self::Request) -> u64;
 
     /// Frees the session's resources. Resolves when they are free for other sessions.

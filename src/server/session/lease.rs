@@ -28,7 +28,7 @@ use tonic::Status;
 /// The maximum number of stored replies of a session with a lease. A client may not have more unanswered requests.
 pub const MAX_STORED_REPLIES: u32 = 64;
 
-/// Why a session cannot be resumed.
+/// Why a session cannot be resumed, or why its old stream ends.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum Error {
@@ -107,7 +107,8 @@ struct LeaseEntry<R> {
     resume_requests: mpsc::Sender<ResumeRequest<R>>,
 }
 
-/// The counters of leases, of sessions without a stream, and of resumed sessions.
+/// The counters of leases, of sessions without a stream, of resumed sessions, and of streams admitted above the session
+/// limit.
 #[derive(Clone, Default)]
 pub struct LeaseCounters(Arc<LeaseCounts>);
 
@@ -208,7 +209,7 @@ impl<R> Leases<R> {
         Self(Arc::new(LeaseRegistry { time, counters, leases: Mutex::default() }))
     }
 
-    /// Grants a lease to the session of this token. Returns `None` if leases are switched off.
+    /// Grants a lease to a session whose token is `bearer`. Returns `None` if leases are switched off.
     ///
     /// # Errors
     /// [`NoRandomness`], if the operating system has no random bits for the lease's name.
@@ -228,7 +229,8 @@ impl<R> Leases<R> {
     /// that the client received.
     ///
     /// # Errors
-    /// [`Error`], if there is no such session, or it cannot be resumed from that reply.
+    /// [`Error`], if there is no such session, if it belongs to another token, or if it cannot be resumed from that
+    /// reply.
     pub async fn resume(
         &self,
         name: &[u8],

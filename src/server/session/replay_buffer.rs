@@ -1,4 +1,4 @@
-//! Stores a session's numbered replies until its client must have received them.
+//! Stores a session's numbered replies until the session's client has certainly received them.
 
 use super::lease::Error;
 use std::collections::VecDeque;
@@ -52,7 +52,8 @@ impl<R> ReplayBuffer<R> {
     /// Checks that all replies after number `number` are stored.
     ///
     /// # Errors
-    /// [`Error::NoReply`] if that reply was never sent, [`Error::Forgotten`] if a later reply has been dropped.
+    /// [`Error::NoReply`] if `number` is larger than the number of the last reply, [`Error::Forgotten`] if a reply
+    /// after `number` has been dropped.
     pub fn check(&self, number: u64) -> Result<(), Error> {
         let (last, first) = (self.last, self.last - self.replies.len() as u64);
         if number > last {
@@ -99,7 +100,7 @@ mod tests {
 
     proptest! {
         /// A client with at most `max_unanswered` unanswered requests finds all replies that it has not received. The
-        /// server never stores more.
+        /// buffer never stores more than `max_unanswered` replies.
         #[test]
         fn unreceived_replies_stay_stored_within_the_limit(
             max_unanswered in 1_usize..8,

@@ -9,8 +9,8 @@ use std::sync::{
     atomic::{AtomicUsize, Ordering},
 };
 
-/// A handle to the server's memory budget. Reservations made through it also count against the quota of its token, if
-/// it has one.
+/// A handle to the server's memory budget. If the handle has a token, reservations made through the handle also count
+/// against the token's quota.
 #[derive(Clone)]
 pub struct Budget {
     state: Arc<BudgetCounter>,
@@ -28,7 +28,8 @@ impl Budget {
         Self { state: Arc::new(BudgetCounter { used: AtomicUsize::new(0), limit }), bearer: None }
     }
 
-    /// Returns a handle to the same budget whose reservations also count against this token's quota.
+    /// Returns another handle to this budget. Reservations made through that handle also count against this token's
+    /// quota.
     pub fn for_token(&self, bearer: Option<Bearer>) -> Self {
         Self { state: Arc::clone(&self.state), bearer }
     }

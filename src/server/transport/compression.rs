@@ -7,7 +7,7 @@ use std::{
 };
 use tonic::codegen::http::HeaderMap;
 
-/// The HTTP header of a call that names the compression of its messages.
+/// The HTTP header that names the compression of a call's messages.
 const ENCODING_HEADER: &str = "grpc-encoding";
 /// The maximum number of compressed bytes that one call of `append_part` reads. The limit bounds the call's time even
 /// for input that decompresses to nothing.
@@ -25,8 +25,8 @@ pub(super) enum Compression {
 }
 
 impl Compression {
-    /// Returns the compression that a call's headers announce, or `None` if its messages may not be compressed. tonic
-    /// refuses other compressions.
+    /// Returns the compression that a call's headers announce. Returns `None` if they announce none; the call's
+    /// messages must then be uncompressed. tonic refuses calls with other compressions.
     pub(super) fn from_headers(headers: &HeaderMap) -> Option<Self> {
         match headers.get(ENCODING_HEADER)?.as_bytes() {
             b"gzip" => Some(Self::Gzip),

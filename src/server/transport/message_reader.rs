@@ -26,7 +26,7 @@ const HEADER_BYTES: usize = 5;
 /// send a small message.
 const UNBUDGETED_BYTES: usize = 64 << 10;
 /// The minimum average rate at which a message must arrive, bytes per second. A message may take
-/// [`StreamLimits::limit`] longer than it takes at this rate.
+/// [`StreamLimits::limit`] longer than it would take at this rate.
 const MIN_BYTES_PER_SECOND: usize = 64 << 10;
 /// A message of at least this length, in bytes, gets an allocation of its own.
 const OWN_BUFFER_MIN_BYTES: usize = 1 << 20;
@@ -151,7 +151,8 @@ impl MessageReader {
     /// dropped, the next call continues reading.
     ///
     /// # Errors
-    /// If the stream must end: the message is too long, stays incomplete, or is not gRPC, or the connection is lost.
+    /// If the stream must end: the message is too long, incomplete or malformed, the client has cancelled the stream,
+    /// or the connection is lost.
     pub async fn next(&mut self, limits: RequestLimits) -> Result<Option<Message>, StreamStop> {
         loop {
             if self.message.is_none() && self.buffer.len() >= HEADER_BYTES {
@@ -170,8 +171,8 @@ impl MessageReader {
                     }
                 }
                 Some(Err(status)) if status.code() == Code::Cancelled => return Err(StreamStop::Cancelled),
-                // If a connection was closed for missing keepalives, its body ends without an error and without the end
-                // of the stream.
+                // If the client did not answer keepalives, the connection was closed. Then the body ends without an
+                // error, but the stream has not ended.
                 None if !self.body.is_end_stream() => return Err(StreamStop::Cancelled),
                 Some(Err(status)) => return Err(status.into()),
                 None if self.buffer.is_empty() && self.message.is_none() => return Ok(None),
@@ -224,8 +225,9 @@ impl MessageReader {
                 let bytes = if *length < OWN_BUFFER_MIN_BYTES {
                     self.buffer.split_to(*length).freeze()
                 } else {
-                    // Returns the buffer itself as the message. A slice of the buffer would keep all of the buffer's
-                    // memory alive.
+                    // Gives the message the buffer's allocation, and copies the bytes after the message to a new
+                    // buffer. If both shared the allocation, the reader would keep the message's memory alive after the
+                    // message is dropped.
                     let rest = BytesMut::from(&self.buffer[*length..]);
                     let mut whole = std::mem::replace(&mut self.buffer, rest);
                     whole.truncate(*length);
@@ -287,7 +289,7 @@ impl MessageReader {
             let (before, after) = (budgeted_bytes(self.buffer.len()), budgeted_bytes(self.buffer.len() + data.len()));
             if let Err(refusal) = self.reservation.grow(after - before) {
                 self.reservation = self.stream_limits.budget.empty();
-                // Frees the bytes of the message that have already arrived, together with their reservation.
+                // Frees the bytes of the message that have already arrived. The line above released their reservation.
                 let arrived = std::mem::take(&mut self.buffer).len();
                 self.message = Some(PartialMessage::Refused(length - arrived, refusal));
             }

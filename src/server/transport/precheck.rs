@@ -13,8 +13,8 @@ use std::sync::Arc;
 use tokio::sync::Semaphore;
 use tonic::Status;
 
-/// The maximum number of fields for which a request is decoded on the transport thread, because handing the request to
-/// another thread would take longer.
+/// A request with at most this many fields is decoded on the transport thread, because passing it to another thread
+/// would take longer.
 const INLINE_DECODE_MAX_FIELDS: usize = 1000;
 /// The maximum number of requests that are decoded at the same time outside the transport threads.
 const MAX_CONCURRENT_DECODES: usize = 2;
@@ -28,7 +28,7 @@ const PACKED_BYTES_PER_FIELD: usize = 64;
 /// The maximum number of [`Field`]s that a message type may have.
 const MAX_COUNTED_FIELDS: usize = 8;
 
-/// A field of a message whose entries are counted and limited before decoding.
+/// A field of a message type. The number of the field's entries is checked before a message is decoded.
 pub struct Field {
     number: u64,
     name: &'static str,
@@ -38,7 +38,7 @@ pub struct Field {
 
 /// The type of a field's entries.
 pub enum FieldKind {
-    /// Nested messages. If a field of such a message is in this list, its entries are also counted.
+    /// Nested messages, with the list of their fields whose entries are also counted.
     Fields(&'static [Field]),
     /// Numbers, packed or unpacked.
     Numbers,
@@ -66,7 +66,7 @@ impl Cardinality {
     }
 }
 
-/// Makes a [`Field`] with its field number, its name in errors, its maximum number of entries, and their type.
+/// Makes a [`Field`] from its field number, its name in errors, the maximum number of its entries, and their type.
 pub const fn field(number: u64, name: &'static str, max_entries: Cardinality, kind: FieldKind) -> Field {
     Field { number, name, max_entries, kind }
 }
@@ -81,8 +81,8 @@ impl Default for Decoder {
     }
 }
 
-/// Decodes a request on the calling thread. Returns `None` if it is malformed, has too many entries, or is so large
-/// that it must be decoded on another thread.
+/// Decodes a request on the calling thread. Returns `None` if the request is malformed, has too many entries, or has so
+/// many fields that it must be decoded on another thread.
 pub fn decoded_at_once<T: Message + Default>(
     bytes: Bytes,
     fields: &'static [Field],

@@ -17,7 +17,7 @@ use tokio::{
 };
 use tonic::{Status, body::Body};
 
-/// The number of times that unread replies are checked within the length of their timeout.
+/// The number of checks for unread replies in the time of one timeout.
 const CHECKS_PER_TIMEOUT: u32 = 4;
 
 /// The maximum times for which a stream's client may leave replies unread.
@@ -39,8 +39,8 @@ pub struct WatchedBody {
 /// The client's progress in reading replies.
 struct ReadProgress {
     state: Mutex<ProgressState>,
-    /// The task that checks the timeouts. The task holds the connection, so the task is aborted when the body is
-    /// dropped.
+    /// The task that checks the timeouts. The task holds a handle to the connection, so the task is aborted when this
+    /// value is dropped.
     watch: OnceLock<AbortHandle>,
 }
 
@@ -74,8 +74,8 @@ impl ReadProgress {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Changes the number of unread replies. Restarts their timeout when the client has read a reply, or when the first
-    /// reply becomes unread.
+    /// Changes the number of unread replies. Restarts their timeout if the client has read a reply, or if no reply was
+    /// unread before.
     fn change(&self, change: impl FnOnce(usize) -> usize) {
         let mut state = self.state();
         let (before, after) = (state.unread, change(state.unread));
@@ -93,7 +93,7 @@ impl ReadProgress {
         }
     }
 
-    /// Records that the transport has received data, which may wait for the client's window.
+    /// Records that the transport has taken data from the body. The data may have to wait for the client's window.
     fn on_frame(&self) {
         self.state().blocked_since = Some(Instant::now());
     }

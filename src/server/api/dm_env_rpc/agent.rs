@@ -28,17 +28,17 @@ use crate::{
 };
 use std::sync::Arc;
 
-/// The price of `create_world`, in steps: the same as of an `open` of one environment in `perturb.v1`.
+/// The price of `create_world`, in steps: the price of opening a session with one environment in `perturb.v1`.
 const WORLD_PRICE: u64 = 17;
-/// The price of `reset` and `reset_world`, in steps: the same as of a `reset` of one environment in `perturb.v1` that
-/// begins a new trial.
+/// The price of `reset` and `reset_world`, in steps: the price of beginning a new trial in one environment by a `reset`
+/// in `perturb.v1`.
 const NEW_TRIAL_PRICE: u64 = 3;
 /// The maximum length of a request, bytes. Valid requests are far shorter, because a world has one environment. An
 /// invalid request up to this length gets an in-band error; a longer request ends the stream.
 const MAX_REQUEST_BYTES: usize = 1 << 20;
 
-/// The state of a client's stream. When it is dropped, the agent leaves the joined world, and the worlds made by the
-/// stream are freed unless they have another agent.
+/// The state of a client's stream. Dropping the state makes the agent leave its joined world, and frees the worlds that
+/// the stream made. A world that another stream's agent has joined is not freed.
 pub(super) struct Agent {
     worlds: Arc<Worlds>,
     caller: Caller,
@@ -195,7 +195,7 @@ impl SessionHandler for Agent {
         }
     }
 
-    /// Does nothing: the world is freed when the agent is dropped.
+    /// Does nothing: the worlds that the stream made are freed when the agent is dropped.
     async fn close(&mut self) {}
 
     async fn answer(&mut self, request: Self::Request) -> Result<Reply<Self::Response>, Error> {

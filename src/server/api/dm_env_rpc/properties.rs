@@ -1,5 +1,5 @@
-//! Properties: named values that are neither actions nor observations. A read returns the value of the episode that
-//! began last. A write takes effect when the next episode begins.
+//! Properties: named values that are neither actions nor observations. A read of a world's property returns the value
+//! in the episode that began last. A write takes effect when the next episode begins.
 
 use super::{
     Error,
@@ -87,7 +87,8 @@ fn properties(catalogue: &Catalogue, joined: Option<&JoinedWorld>) -> Vec<Proper
             tensors::tensor(Payload::Strings(StringArray { array: names }), &[n]),
         ),
     ];
-    // Worlds are opened with receipts, so every joined world has the start of an episode.
+    // The pool reports starts of episodes only if a batch has receipts. Every world has receipts, so a joined world
+    // always has a start.
     if let Some((joined, start)) = joined.and_then(|joined| Some((joined, joined.runner.start()?))) {
         all.extend(of_world(joined, start.id, start.receipt.as_ref()));
     }

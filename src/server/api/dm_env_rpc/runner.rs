@@ -64,7 +64,8 @@ impl Runner {
     /// Creates the environment of a new world.
     ///
     /// # Errors
-    /// If the pool is full, a model cannot be loaded, or the token may not draw from these distributions.
+    /// If the pool is full, a model cannot be loaded, the token may not draw from these distributions, or the ledger
+    /// cannot be written.
     pub(super) async fn open(
         pool: &Pool,
         settings: BatchSettings,
@@ -79,7 +80,7 @@ impl Runner {
         Ok(Self { batch, draws, phase: EpisodePhase::Unseen, first, start: only(started), seed, version })
     }
 
-    /// The settings of episodes with which the world was created.
+    /// The episode settings with which the world was created.
     pub(super) fn episodes(&self) -> &EpisodeSettings {
         &self.batch.settings().groups[0].episodes
     }
@@ -126,15 +127,15 @@ impl Runner {
         self.batch.finish_abandoned().await;
     }
 
-    /// Begins the next episode, and returns its first observation. The first episode of a new world has already begun
-    /// with the world, so a first call without changes only returns that observation. If there are changes, a new trial
-    /// begins.
+    /// Begins the next episode, and returns its first observation. The first episode of a new world began when the
+    /// world was created. So the first call only returns the first observation of this episode, unless there are
+    /// changes. If there are changes, a new trial begins.
     ///
     /// # Errors
     /// If the token may not draw from the new distributions, the ledger cannot be written, or the server has a defect.
     pub(super) async fn begin(&mut self, changes: Changes) -> Result<WorldStep, Error> {
         let Changes { version, seed, distributions } = changes;
-        // The first episode of a new world has already begun. Unless there are changes, it is used.
+        // The first episode of a new world has already begun. Unless there are changes, it needs no reset.
         if self.phase != EpisodePhase::Unseen || seed.is_some() || distributions.is_some() {
             let entries = vec![ResetEntry { slot: 0, seed, distributions, state: None }];
             self.draws.reset(&self.batch, &entries).await?;
@@ -154,7 +155,7 @@ impl Runner {
         })
     }
 
-    /// Advances the running episode by a step. If `interrupted`, also ends it.
+    /// Advances the running episode by a step. If `interrupted`, the episode ends with this step.
     ///
     /// # Errors
     /// If the server has a defect.

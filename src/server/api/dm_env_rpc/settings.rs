@@ -149,8 +149,8 @@ fn version(settings: &WorldSettings) -> Result<Option<Version>, Error> {
     settings.get(VERSION).map(read).transpose()
 }
 
-/// Returns the name of each parameter of the environment for which `settings` has a value, with this value as its
-/// distribution.
+/// Returns the environment's parameters that have a value in `settings`: the name of each, and a distribution that is
+/// fixed at the value.
 fn parameters(spec: &EnvironmentSpec, settings: &WorldSettings) -> Result<Vec<(&'static str, Distribution)>, Error> {
     let given = spec.parameters.iter().filter_map(|p| Some((p.name, settings.get(p.name)?)));
     given.map(|(name, tensor)| Ok((name, Distribution::fixed(tensors::number(&field(name), tensor)?)))).collect()

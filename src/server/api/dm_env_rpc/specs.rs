@@ -1,4 +1,5 @@
-//! The specs (uid, name, type and bounds) of actions and observations, and their conversion.
+//! The specs (uid, name, type and bounds) of actions and observations. Converts actions from tensors, and observations
+//! to tensors.
 
 use super::{Error, runner::WorldStep, tensors};
 use crate::{

@@ -44,7 +44,7 @@ pub(super) fn number(field: &str, tensor: &Tensor) -> Result<f64, Error> {
     }
 }
 
-/// Returns the value of an integer scalar, of any type with 32 or 64 bits.
+/// Returns the value of a scalar of any integer type with 32 or 64 bits.
 ///
 /// # Errors
 /// If `tensor` is not an integer scalar, or not in `low` … `high`.

@@ -94,8 +94,8 @@ impl World {
         }
     }
 
-    /// Stores changes again, because the episode for which they were taken could not begin. Later changes take
-    /// precedence.
+    /// Stores changes again, because the episode for which they were taken could not begin. Changes that were stored in
+    /// the meantime take precedence.
     pub(super) fn restore_changes(&self, changes: Changes) {
         let mut pending = self.lock();
         pending.seed = pending.seed.or(changes.seed);

@@ -41,7 +41,8 @@ impl Caller {
     }
 }
 
-/// The name of the token of a world's maker, and the world's name. Each token has its own set of names.
+/// The name of the token with which a world was made, `None` without a token; and the world's name. Each token has its
+/// own set of names.
 type Key = (Option<String>, String);
 
 /// The worlds of a server, shared by all streams.
@@ -111,8 +112,8 @@ impl Worlds {
         }
     }
 
-    /// Adds a new world with its runner. The world keeps `held`, its environment's part of the token's quota. Returns
-    /// the world's name.
+    /// Adds a new world with its runner. The world keeps `held`, the guard that takes the world's environment from the
+    /// token's quota. Returns the world's name.
     ///
     /// # Errors
     /// [`Error::Taken`] if another world has the requested name, [`Error::NoRandomness`] if no random name can be made.
@@ -147,7 +148,7 @@ impl Worlds {
     /// Returns the world with this name, if the stream may reset and destroy it.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if it belongs to another stream.
+    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if the stream may not reset and destroy it.
     pub(super) fn find_owned(&self, caller: &Caller, name: &str, request: &'static str) -> Result<Arc<World>, Error> {
         Ok(Arc::clone(&self.lock().find_owned(caller, name, request)?.world))
     }
@@ -177,7 +178,7 @@ impl Worlds {
     /// Destroys a world and frees its environment.
     ///
     /// # Errors
-    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if it belongs to another stream,
+    /// [`Error::Unknown`] if there is no such world, [`Error::NotYours`] if the stream may not destroy it,
     /// [`Error::Occupied`] if it has an agent.
     pub(super) fn destroy(&self, caller: &Caller, name: &str) -> Result<(), Error> {
         let mut registry = self.lock();

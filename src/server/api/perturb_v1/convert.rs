@@ -16,7 +16,8 @@ use bytes::Bytes;
 use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, PICTURE_PIXELS};
 use std::{collections::HashMap, sync::Arc};
 
-/// Checks an `open` request, and converts it to the settings of its batch. `max_envs` is the maximum number of groups.
+/// Checks an `open` request, and converts it to the settings of its batch. `max_envs` is the server's maximum number of
+/// environments. It also limits the number of groups.
 pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Result<BatchSettings, Error> {
     let spec = with_parameters(catalogue.find(&request.environment)?, &request)?;
     let autoreset = match request.autoreset_mode() {

@@ -1,4 +1,4 @@
-//! The fields of requests whose numbers of entries are checked before a request is decoded.
+//! The fields whose entries are counted and limited before a request is decoded.
 
 use crate::server::transport::precheck::{
     Cardinality, Field,

@@ -151,7 +151,7 @@ fn policy(
     Ok(ReceivedPolicy { spec, inputs, normalisers, role, state, weights, episodes_per_trial })
 }
 
-/// Checks the layer sizes of a policy whose input has `input_size` numbers.
+/// Checks the layer sizes of a policy, and returns its [`PolicySpec`]. The policy's input has `input_size` numbers.
 fn spec(policy: &proto::Policy, input_size: usize, sizes: Sizes) -> Result<PolicySpec, Error> {
     const FIELD: &str = "act.policy.hidden";
     if policy.hidden.len() > MAX_HIDDEN_LAYERS {
@@ -196,7 +196,8 @@ fn read<'a, M, T: TryFrom<&'a M, Error = DecodeError>>(
     given.as_ref().map(T::try_from).transpose().map_err(in_message(field))
 }
 
-/// Returns a function that converts errors of decoding, and prefixes their fields with `message`.
+/// Returns a function that converts a decoding error to an [`Error`], with the prefix `message` before the field's
+/// name.
 fn in_message(message: &'static str) -> impl Fn(DecodeError) -> Error {
     move |wrong| {
         let DecodeError { field, got, expected } = wrong.within(message);

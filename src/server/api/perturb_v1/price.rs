@@ -9,11 +9,11 @@ const OPEN_PRICE: u64 = 16;
 const RESTORED_PRICE: u64 = 4;
 /// The number of pixels of a picture that are charged as one step.
 const PIXELS_PER_STEP: u64 = 1024;
-/// The fixed price of each request other than `open`, `step` and `act`.
+/// The fixed part of the price of each request other than `open`, `step` and `act`.
 const REQUEST_PRICE: u64 = 1;
 
-/// Returns the price of a request without the steps that it runs: 0 for `step` and `act`. The environments of an `open`
-/// are charged separately when they are created.
+/// Returns the price of a request, not counting the steps that the request runs. The price of `step` and `act` is 0.
+/// The environments of an `open` are charged separately when they are created.
 pub fn price(request: Option<&Request>, batch: Option<&Batch>) -> u64 {
     let size = batch.map_or(0, Batch::size);
     let selected = |mask: &[u8]| if mask.is_empty() { size } else { mask.iter().filter(|&&entry| entry != 0).count() };

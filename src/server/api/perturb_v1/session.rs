@@ -58,12 +58,13 @@ pub struct Session {
     step_memory: Option<MemoryReservation>,
     /// The memory reserved for the current policy's weights.
     weights_memory: Option<MemoryReservation>,
-    /// The memory reserved for the current policy's activations. New weights for the same policy leave it as it is.
+    /// The memory reserved for the current policy's activations. New weights for the same policy do not change this
+    /// reservation.
     activations_memory: Option<MemoryReservation>,
 }
 
 impl Session {
-    /// Makes a session that is not open yet. It reserves memory for its replies in `budget`.
+    /// Makes a session that is not open yet. The session will reserve memory in `budget`.
     pub fn new(context: Arc<ServerContext>, bearer: Option<Bearer>, budget: Budget) -> Self {
         let draws = DrawAuditor::new(bearer.clone(), context.ledger.clone());
         Self {
@@ -206,6 +207,7 @@ impl Session {
         let slots = convert::release(batch.size(), &request)?;
         self.draws.release(batch, &slots);
         batch.release(&slots).await?;
+        self.forget_policy();
         if let Some(env_quota) = &mut self.env_quota {
             env_quota.release(slots.len());
         }
@@ -225,7 +227,7 @@ impl Session {
         Ok(Reply { memory: Some(reservation), ..reply(Response::Act(acted)) })
     }
 
-    /// Frees the memory of the policy, because requests other than `act` discard it.
+    /// Frees the memory that was reserved for the policy, after the batch has discarded the policy.
     fn forget_policy(&mut self) {
         (self.weights_memory, self.activations_memory) = (None, None);
     }
@@ -354,7 +356,7 @@ impl SessionHandler for Session {
         }
     }
 
-    /// A step may be pipelined behind another step, unless the token has a rate limit.
+    /// A step may be pipelined behind another step, if [`Batch::step_queue`] allows it and the token has no rate limit.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
         let has_no_rate = self.bearer.as_ref().is_none_or(|bearer| bearer.rate().is_none());

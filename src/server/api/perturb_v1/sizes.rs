@@ -9,7 +9,7 @@ use crate::{
 };
 
 /// The part of a request's maximum length that does not depend on the batch size, bytes. It has room for parameters,
-/// and for invalid requests, so that these get an error in-band.
+/// and for invalid requests that are a little too long, so that such requests get an in-band error.
 const REQUEST_OVERHEAD_BYTES: usize = 1 << 20;
 /// The maximum encoded length of an integer field with its tag, bytes.
 const MAX_VARINT_FIELD_BYTES: usize = 11;
@@ -101,8 +101,8 @@ pub fn max_rollout_bytes(request: &RolloutRequest, batch: &Batch) -> usize {
 const MAX_ROLLOUT_BYTES: usize = 4_000_000;
 
 /// Returns an upper bound of the length of a reply to `step`, `reset` or `restore` of `size` environments, bytes. The
-/// bound is reached when all episodes end in the same step with the largest counters. `environment` is the entry of the
-/// catalogue.
+/// bound is reached when all episodes end in the same step with the largest counters. `environment` is the
+/// environment's entry in the catalogue.
 pub fn max_step_reply_bytes(settings: &BatchSettings, environment: &proto::Environment, size: usize) -> usize {
     let receipt = proto::Receipt {
         requested: vec![1.0; environment.parameters.len()],
@@ -153,7 +153,8 @@ pub fn max_snapshot_reply_bytes(size: usize, snapshot: usize) -> usize {
     size.saturating_mul(1 + prost::length_delimiter_len(snapshot) + snapshot).saturating_add(FRAMING_BYTES)
 }
 
-/// Returns the encoded length of a message as an entry of a repeated field whose tag has one byte, bytes.
+/// Returns the encoded length, in bytes, of an entry of a repeated field. `message` is the entry, and the field's tag
+/// has one byte.
 fn entry(message: &impl prost::Message) -> usize {
     let length = message.encoded_len();
     1 + prost::length_delimiter_len(length) + length
