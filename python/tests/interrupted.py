@@ -62,7 +62,7 @@ class Stepping:
         try:
             observed = self._step()
         except perturb.OutOfOrderError as gone:
-            if not re.search(r"call reset\(\) to begin anew.* interrupted", str(gone)):
+            if not re.search(r"call reset\(\) to open a new one.* interrupted", str(gone)):
                 raise
             self._begin()
             return False

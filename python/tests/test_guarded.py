@@ -170,7 +170,7 @@ def test_observations_are_the_same_with_and_without_credentials(
         ),
         pytest.param(
             TRUST | TOKEN | {"PERTURB_CERT": "client.pem"},
-            "{address}: PERTURB_CERT is set and PERTURB_KEY is not; both are expected, or none",
+            "{address}: PERTURB_CERT is set, but PERTURB_KEY is not; set both or neither",
             id="certificate-without-key",
         ),
         pytest.param(
@@ -227,10 +227,10 @@ def test_the_refusal_of_a_wrong_scheme_names_the_right_one(
     guarded: str, start: Callable[[Files], str], have: Callable[[Files], None]
 ) -> None:
     have(ALL)
-    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match=f"it speaks TLS; write {guarded}"):
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match=f"the server uses TLS; write {guarded}"):
         perturb.PerturbEnv("CartPole", server=guarded.removeprefix("https://")).reset()
     plain = start(TOKENS).removeprefix("http://")
-    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="write tcp:// for https://"):
+    with within(SECONDS), pytest.raises(perturb.ServerConnectionError, match="write tcp:// instead of https://"):
         perturb.PerturbEnv("CartPole", server=f"https://{plain}").reset()
 
 
@@ -298,7 +298,7 @@ def test_sessions_end_when_their_token_is_revoked(
         pytest.raises(perturb.ServerConnectionError, match='refuses this process: the token "ann" was revoked'),
     ):
         step_until_error(envs)
-    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to begin anew.* was revoked"):
+    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to open a new one.* was revoked"):
         envs.step(np.zeros(2, dtype=np.int64))
     with pytest.raises(perturb.ServerConnectionError, match="does not know the token"):
         envs.reset()

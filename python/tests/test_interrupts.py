@@ -77,7 +77,7 @@ def test_a_reset_works_after_a_second_interrupt(
     with monkeypatch.context() as patched, interrupting(envs):
         patched.setattr(session.Session, "_failed", interrupt)
         envs.step(actions)
-    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to begin anew.* interrupted"):
+    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to open a new one.* interrupted"):
         envs.step(actions)
     running.process.send_signal(signal.SIGCONT)
     assert envs.reset(seed=2)[0].tobytes() == expected

@@ -133,7 +133,7 @@ def test_a_reply_of_another_kind_is_refused(fake: FakeServer) -> None:
     env.reset()
     with pytest.raises(perturb.ProtocolError, match="answered step with reset"):
         env.step(0)
-    with pytest.raises(perturb.OutOfOrderError, match="gone"):
+    with pytest.raises(perturb.OutOfOrderError, match="has ended"):
         env.step(0)
 
 
@@ -166,7 +166,7 @@ def floats(*numbers: float) -> bytes:
         ({"observations": floats(0, 0, NAN, 0)}, "the number NaN in the observation of slot 0"),
         ({"terminated": b"\7"}, "the flag 7 of terminated in slot 0; expected 0 or 1"),
         ({"truncated": b"\2"}, "the flag 2 of truncated in slot 0"),
-        ({"terminated": b"\1"}, "0 ended episodes; expected 1, as many as are flagged"),
+        ({"terminated": b"\1"}, "0 ended episodes; expected 1, the number of environments flagged as ended"),
         ({"ended": [pb.EpisodeEnd()], "final_observations": bytes(16)}, "slot 0, which is not flagged as ended"),
     ],
 )
@@ -201,7 +201,7 @@ def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
     time.sleep(0.5)  # meanwhile the keepalive thread polls the session, so the second reply arrives
     with pytest.raises(perturb.ProtocolError, match="a second reply to an earlier request"):
         env.step(0)
-    with pytest.raises(perturb.OutOfOrderError, match="gone"):
+    with pytest.raises(perturb.OutOfOrderError, match="has ended"):
         env.step(0)
 
 

@@ -298,7 +298,10 @@ async fn a_stale_socket_is_replaced_a_live_one_and_a_file_are_not() {
     let second = finished(&mut listen());
     assert_eq!(second.status.code(), Some(2));
     let message = String::from_utf8(second.stderr).unwrap();
-    assert!(message.contains("cannot listen at") && message.contains("another program does"), "{message}");
+    assert!(
+        message.contains("cannot listen at") && message.contains("another program already listens there"),
+        "{message}"
+    );
     assert_eq!(health(&address, SERVICE).await.unwrap(), ServingStatus::Serving, "the first is still there");
     drop(server); // kills it, so that the socket's file stays
     assert!(UnixStream::connect(&socket).is_err() && socket.exists());
@@ -344,7 +347,7 @@ async fn socket_of_a_stuck_server_is_in_use() {
         command.args(["--listen", &address]);
         command
     });
-    assert!(message.contains("another program does"), "{message}");
+    assert!(message.contains("another program already listens there"), "{message}");
 }
 
 #[tokio::test]
@@ -378,7 +381,7 @@ fn a_port_in_use_is_an_error_that_names_it() {
     let message = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(2));
     let named = message.contains(&taken.local_addr().unwrap().to_string());
-    assert!(named && message.contains("another program does"), "{message}");
+    assert!(named && message.contains("another program already listens there"), "{message}");
 }
 
 #[test]

@@ -106,7 +106,7 @@ impl Connection {
                         Address::Tcp { host, port, tls: None },
                         Err(ClientError::NotPerturb { .. } | ClientError::Connect { .. }),
                     ) if speaks_tls(host, *port).await => {
-                        let reason = format!("it speaks TLS; write {}", address.with_tls());
+                        let reason = format!("the server uses TLS; write {}", address.with_tls());
                         Err(ClientError::Unsafe { address: address.clone(), reason })
                     }
                     (_, opened) => opened,

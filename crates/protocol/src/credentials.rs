@@ -140,8 +140,8 @@ fn identity(variable: Variable<'_>) -> Result<Option<Identity>, String> {
             let content = read_plain(&key, MAX_CERTIFICATES_BYTES).map_err(|error| wrong(&error))?;
             Ok(Some((chain, PrivateKeyDer::from_pem_slice(&content).map_err(|error| wrong(&error))?)))
         }
-        (Some(_), None) => Err(format!("{CERT} is set and {KEY} is not; both are expected, or none")),
-        (None, Some(_)) => Err(format!("{KEY} is set and {CERT} is not; both are expected, or none")),
+        (Some(_), None) => Err(format!("{CERT} is set, but {KEY} is not; set both or neither")),
+        (None, Some(_)) => Err(format!("{KEY} is set, but {CERT} is not; set both or neither")),
     }
 }
 

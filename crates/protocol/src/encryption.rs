@@ -112,7 +112,8 @@ impl Service<Uri> for Connector {
             stream.map(|stream| TokioIo::new(AlertRecordingStream { stream, shows_certificate, failure })).map_err(
                 |error| match error.kind() {
                     io::ErrorKind::UnexpectedEof | io::ErrorKind::ConnectionReset => io::Error::other(
-                        "it ended the connection in TLS's handshake; if it speaks no TLS, write tcp:// for https://",
+                        "it ended the connection in TLS's handshake; if the server does not use TLS, write \
+                         tcp:// instead of https://",
                     ),
                     _ => error,
                 },
@@ -144,7 +145,10 @@ fn describe_failure(error: &io::Error, host: &str) -> Option<String> {
         }
         Error::InvalidCertificate(other) => format!("its certificate is not good: {other}"),
         Error::InvalidMessage(InvalidMessage::InvalidContentType) => {
-            format!("it speaks no TLS; write tcp:// for https://, or see who listens at {host}")
+            format!(
+                "the server does not use TLS; write tcp:// instead of https://, or check which program listens at \
+                 {host}"
+            )
         }
         Error::AlertReceived(
             AlertDescription::ProtocolVersion

@@ -90,7 +90,7 @@ fn check_ended(ended: &[proto::EpisodeEnd], terminated: &[u8], truncated: &[u8])
     if flagged != ended.len() {
         return Err(Malformed::new(
             format!("{} ended episodes", ended.len()),
-            format!("{flagged}, as many as are flagged"),
+            format!("{flagged}, the number of environments flagged as ended"),
         ));
     }
     Ok(())
@@ -217,7 +217,7 @@ mod tests {
             it.ended.clear();
             it.final_observations = bytes::Bytes::new();
         });
-        assert_eq!(missing, "0 ended episodes; expected 1, as many as are flagged");
+        assert_eq!(missing, "0 ended episodes; expected 1, the number of environments flagged as ended");
     }
 
     #[test]

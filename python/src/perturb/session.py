@@ -146,7 +146,7 @@ class Session:
             )
         gone = self._end_reason()
         if gone is not None:
-            raise OutOfOrderError(f"this environment is gone, call reset() to begin anew: {gone}")
+            raise OutOfOrderError(f"the session of this environment has ended; call reset() to open a new one: {gone}")
 
     def _end_reason(self) -> str | None:
         """Return the reason why the session has ended, or None if it has not."""

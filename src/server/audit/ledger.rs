@@ -225,7 +225,7 @@ impl LedgerWriter {
                 tracing::error!(
                     lines,
                     head,
-                    "the ledger {}: {reason}; until then requests that draw parameters are refused",
+                    "the ledger {}: {reason}; until this is repaired, requests that draw parameters are refused",
                     self.path.display()
                 );
             }
@@ -249,8 +249,8 @@ impl LedgerWriter {
         if own.len() < self.bytes || (own.len() > self.bytes && !self.is_torn) {
             let (got, expected) = (own.len(), self.bytes);
             return Err(format!(
-                "the file has {got} bytes, but the server wrote {expected}; write back into it what another program \
-                 changed, or restart the server"
+                "the file has {got} bytes, but the server wrote {expected}; undo the change that another program \
+                 made to the file, or restart the server"
             ));
         }
         Ok(())

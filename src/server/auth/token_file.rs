@@ -14,9 +14,9 @@ use toml::Spanned;
 /// The minimum length of a token. A shorter token could be guessed.
 const MIN_TOKEN_CHARS: usize = 16;
 /// A description of the file's format for error messages.
-const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", and if need be \
-                     max_sessions = N, max_envs = N, \
-                     max_steps_per_second = N, max_bytes = N and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
+const EXPECTED_ENTRY: &str = "[[token]] with name = \"…\", sha256 = \"64 hexadecimal digits\" or token = \"…\", \
+                     and optionally max_sessions = N, max_envs = N, max_steps_per_second = N, max_bytes = N \
+                     and role = \"…\"; [[role]] with name, draws = [\"D\", \"R\", …] and \
                      never = […]; [[set]] with name, environment, version and parameters";
 
 /// Why a token file is invalid. The message never contains any part of a token.
@@ -85,7 +85,11 @@ pub(super) fn parse(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken
         // The parser's message may quote a token. Messages about keys quote none, so only these messages are passed on.
         let words = error.message();
         let about_keys = ["unknown field", "missing field", "duplicate key"].iter().any(|kind| words.starts_with(kind));
-        let what = if about_keys { words.lines().next().unwrap_or_default() } else { "this cannot be read" };
+        let what = if about_keys {
+            words.lines().next().unwrap_or_default()
+        } else {
+            "this is not valid TOML, or a value is invalid"
+        };
         TokenFileError { line: line(error.span().map_or(0, |span| span.start)), what: what.into() }
     })?;
     // Parameter sets, which roles refer to.
@@ -99,7 +103,9 @@ pub(super) fn parse(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken
         if known_sets.insert(name.clone(), own).is_some() {
             return Err(TokenFileError {
                 line,
-                what: format!("there are two sets called {name:?}; the letters of versions are names of sets, too"),
+                what: format!(
+                    "there are two sets called {name:?}; the names of versions (D, R, E, R+E) are also names of sets"
+                ),
             });
         }
     }
@@ -118,7 +124,8 @@ pub(super) fn parse(catalogue: &Catalogue, text: &str) -> Result<Vec<ParsedToken
             return Err(TokenFileError {
                 line,
                 what: format!(
-                    "the role {name:?} has the key never without the key draws; add draws with what it may draw from"
+                    "the role {name:?} has the key never but not the key draws; add draws, the sets that it may draw \
+                     from"
                 ),
             });
         }

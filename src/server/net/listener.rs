@@ -28,15 +28,22 @@ fn explain(address: &ListenAddress, flag: &str, error: &io::Error) -> String {
     match (address, error.kind()) {
         (ListenAddress::Tcp(tcp), ErrorKind::AddrInUse) => {
             let free = ListenAddress::Tcp(std::net::SocketAddr::new(tcp.ip(), 0)).written();
-            format!("cannot listen at {text}: another program does; end it, or take a free port with {flag} {free}")
+            format!(
+                "cannot listen at {text}: another program already listens there; stop it, or choose a free port with \
+                 {flag} {free}"
+            )
         }
         (_, ErrorKind::AddrInUse) => {
             format!(
-                "cannot listen at {text}: another program does, or the file is not a socket; give {flag} another path"
+                "cannot listen at {text}: another program already listens there, or the file is not a socket; choose \
+                 another path for {flag}"
             )
         }
         (_, ErrorKind::AddrNotAvailable) => {
-            format!("cannot listen at {text}: this machine has no such address; {flag} tcp://0.0.0.0:PORT means all")
+            format!(
+                "cannot listen at {text}: this machine has no such address; use {flag} tcp://0.0.0.0:PORT to listen \
+                 at all addresses"
+            )
         }
         (_, ErrorKind::NotFound) => {
             format!("cannot listen at {text}: its folder does not exist; create it, or correct {flag}")

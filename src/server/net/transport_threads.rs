@@ -92,5 +92,7 @@ pub fn spawn<T: Send + 'static>(
         }
     };
     thread::Builder::new().name(name).spawn(run).map_err(|error| explain_no_thread(&error))?;
-    Ok(async { output.await.map_err(|_| io::Error::other("a transport thread ended from a defect of the server")) })
+    Ok(async {
+        output.await.map_err(|_| io::Error::other("a transport thread ended because of a defect of the server"))
+    })
 }

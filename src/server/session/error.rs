@@ -31,7 +31,7 @@ pub enum Error {
         limit: usize,
     },
     /// The peer has its maximum number of sessions.
-    #[error("all of the {limit} sessions that one machine or user may have here are in use; close one")]
+    #[error("all of the {limit} sessions that one machine or user may have on this server are in use; close one")]
     PeerFull {
         /// The maximum number of sessions of a peer.
         limit: usize,

@@ -39,7 +39,7 @@ pub enum Error {
     #[error("the session was opened with another token; use that token, or open another session")]
     OtherToken,
     /// The client claims to have received a reply that was never sent.
-    #[error("last_reply is {got}, but the session's last reply so far is {last}; the reply to open is number 0")]
+    #[error("last_reply is {got}, but the session's last reply so far is {last}; the reply to open has number 0")]
     NoReply {
         /// The `last_reply` of the client.
         got: u64,

@@ -30,7 +30,7 @@ pub enum Error {
     },
     /// The rest of a message did not arrive within the timeout.
     #[error(
-        "a message is incomplete: no byte of it came for {seconds} s, or it came at less than {rate} bytes per second; \
+        "a message is incomplete: no byte arrived for {seconds} s, or it arrived at less than {rate} bytes per second; \
          send each message without pauses"
     )]
     Unfinished {

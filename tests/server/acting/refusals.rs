@@ -109,7 +109,7 @@ enum Before {
 #[case(Before::Nothing, |a: &mut Act| a.weights = Bytes::new(), "act came with a new policy but without its weights; send both")]
 #[case(Before::Nothing, |a: &mut Act| a.task = None, "act came without a task and none is unfinished; name steps or episodes")]
 #[case(Before::Steps, |a: &mut Act| *a = Act::default(), "act came without a task and none is unfinished")]
-#[case(Before::HalfATask, |a: &mut Act| a.policy = None, "act came with a task while the one before is unfinished; finish it")]
+#[case(Before::HalfATask, |a: &mut Act| a.policy = None, "act came with a task while the previous task is unfinished; finish it")]
 #[case(Before::HalfATask, |a: &mut Act| (a.policy, a.task) = (None, None), "act came with weights while a task is unfinished")]
 #[case(Before::Step, |a: &mut Act| a.policy = None, "send a policy with its weights, also after a step, reset, restore or release")]
 #[case(Before::Reset, |a: &mut Act| a.policy = None, "act came without a policy while none plays")]
@@ -163,11 +163,11 @@ async fn act_is_refused_in_wrong_states_of_the_session() {
     for (open, words) in [
         (
             Open { autoreset_mode: AutoresetMode::NextStep.into(), ..PLAIN.open() },
-            "in a session of another autoreset mode",
+            "in a session whose autoreset mode is not same-step",
         ),
         (
             Open { autoreset_mode: AutoresetMode::Disabled.into(), ..PLAIN.open() },
-            "in a session of another autoreset mode",
+            "in a session whose autoreset mode is not same-step",
         ),
         (groups, "in a session whose groups have trials of different lengths"),
     ] {

@@ -86,10 +86,10 @@ async fn tls_and_plain_connections_that_meet_are_told_apart() {
     let encrypted = Encrypted::usual();
     let plain = encrypted.address().replace("https", "http");
     let words = unsafe_words(connect(&plain, &[]).await);
-    assert!(words.contains("it speaks TLS; write https://"), "{words}");
+    assert!(words.contains("the server uses TLS; write https://"), "{words}");
     let server = Server::start(&[]);
     let error = connect(&server.tcp().replace("http", "https"), &[(CA, &encrypted.ca)]).await.unwrap_err();
-    assert!(error.to_string().contains("write tcp:// for https://"), "{error}");
+    assert!(error.to_string().contains("write tcp:// instead of https://"), "{error}");
 }
 
 #[tokio::test]

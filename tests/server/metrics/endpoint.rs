@@ -83,7 +83,7 @@ fn two_servers_at_one_address_are_refused_with_a_sentence(#[case] address: &str)
     let mut second = command();
     second.args(["--listen", "tcp://127.0.0.1:0", "--metrics", &address]);
     let words = refused(second);
-    assert!(words.contains(&format!("cannot listen at {address}: another program does")), "{words}");
+    assert!(words.contains(&format!("cannot listen at {address}: another program already listens there")), "{words}");
     assert!(words.contains("--metrics") && !words.contains("--listen"), "{words}");
 }
 

@@ -56,7 +56,7 @@ pub enum Error {
         world: String,
     },
     /// The request needs a world without an agent, but the world has one.
-    #[error("world {world:?} has an agent; {request} can be done when the agent has left it")]
+    #[error("world {world:?} has an agent; send {request} after the agent has left the world")]
     Occupied {
         /// The name of the world.
         world: String,

@@ -44,7 +44,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
     let order = |when: &'static str, advice| Error::Order { request: "act", when: when.into(), advice };
     if settings.autoreset != Autoreset::SameStep {
         let advice = "open one with AUTORESET_MODE_SAME_STEP (2)";
-        return Err(order("in a session of another autoreset mode than same-step", advice));
+        return Err(order("in a session whose autoreset mode is not same-step", advice));
     }
     let Some(episodes_per_trial) = settings.episodes_per_trial() else {
         let advice = "open groups that agree in episodes_per_trial, or a session for each number";
@@ -80,7 +80,7 @@ pub fn rollout_request(batch: &Batch, rate: Option<u32>, request: proto::Act) ->
         (None, false) => return Err(order("without a task and none is unfinished", "name steps or episodes")),
         (Some(_), true) => {
             let advice = "finish it by requests without a task, or send another policy";
-            return Err(order("with a task while the one before is unfinished", advice));
+            return Err(order("with a task while the previous task is unfinished", advice));
         }
         _ => {}
     }
