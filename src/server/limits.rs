@@ -9,8 +9,8 @@ pub const MAX_BYTES_BEFORE_OPEN: usize = 1 << 20;
 pub struct RequestLimits {
     /// The maximum length of the request, bytes.
     pub bytes: usize,
-    /// The maximum number of entries in a field that has one entry for each environment. `MAX_REPEATED` entries are
-    /// accepted even if this limit is lower.
+    /// The maximum number of entries in a field that has one entry for each environment. Up to
+    /// [`MAX_REPEATED`](super::transport::precheck::MAX_REPEATED) entries are accepted even if this limit is lower.
     pub entries: usize,
     /// The bytes that the session has already reserved for requests. Up to this length a request needs no new
     /// reservation.

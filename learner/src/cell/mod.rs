@@ -61,7 +61,8 @@ enum Fault {
     Server,
     /// The server has no room for this many environments.
     Room,
-    /// A file could not be read or written.
+    /// The machine could not read or write a file, for example because a disk is full. A missing file is not such a
+    /// fault.
     Files,
     /// The training or its policy has numbers that are not valid, for example NaN. Resuming from the checkpoint would
     /// fail in the same way.

@@ -176,7 +176,8 @@ impl<'a> ClientSession<'a> {
     }
 
     /// Returns an opaque snapshot of each environment in `slots`, in order. Does not change the environments. All
-    /// servers work at the same time. A server sends long snapshots in several replies.
+    /// servers work at the same time. If a server's snapshots are together too long for one reply, they are requested
+    /// in several rounds.
     ///
     /// # Errors
     /// Connection failures.

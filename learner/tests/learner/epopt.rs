@@ -438,7 +438,8 @@ proptest! {
         }
     }
 
-    /// The bytes are equal, because the same sums are computed in the same order.
+    /// An episode's advantages and returns are exactly equal in both computations, because the same sums are computed
+    /// in the same order.
     #[test]
     fn advantages_of_chosen_episodes_are_those_of_each_alone(
         (rollout, chosen) in some_episodes(), bootstrap in any::<bool>()

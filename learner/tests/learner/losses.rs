@@ -36,7 +36,8 @@ fn explained_variance_has_its_limits() {
     assert_eq!(explained_variance(&[1.0, 2.0], &[3.0, 3.0]), None);
 }
 
-/// The fixture has 7 steps of 3 environments, with a termination, truncations, and a step with both flags.
+/// The fixture has 7 steps of 3 environments, with two terminations, two truncations, and a step with both
+/// flags.
 #[test]
 fn advantages_and_returns_agree_with_sums_from_the_definitions() {
     for (case, bootstrap) in [("advantages_bootstrap", true), ("advantages_reference", false)] {

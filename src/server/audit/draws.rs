@@ -60,8 +60,8 @@ struct NextDraw<'a> {
 }
 
 impl DrawAuditor {
-    /// Makes the auditor of a new session. `bearer` is `None` if the session has no token. `ledger` is `None` if the
-    /// server has no ledger.
+    /// Makes the auditor of a new session or world. `bearer` is the token of the session, or of the stream that makes
+    /// the world; `None` if there is no token. `ledger` is `None` if the server has no ledger.
     pub fn new(bearer: Option<Bearer>, ledger: Option<Ledger>) -> Self {
         let session = ledger.as_ref().map_or(0, Ledger::session);
         Self { bearer, ledger, session, refused: Arc::default() }

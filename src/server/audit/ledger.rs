@@ -272,7 +272,7 @@ impl LedgerWriter {
         let written = self.file.write_all(lines.as_bytes());
         let synced = written.and_then(|()| unless_unsupported(Operation::Sync, self.file.sync_data(), &self.path));
         if let Err(error) = synced {
-            // Cuts off the incomplete line that a failed write may leave.
+            // Cuts off everything that this call wrote: a failed write may leave an incomplete line.
             self.is_torn = self.file.set_len(self.bytes).is_err();
             return Err(error.to_string());
         }

@@ -8,8 +8,8 @@ use std::fmt;
 #[derive(Debug, Clone, PartialEq)]
 pub struct TokenRole {
     pub(super) name: String,
-    /// The sets that a session may draw from: each box of its region must be inside a box of one of these sets. `None`
-    /// for no limit.
+    /// The sets that a session may draw from. A region is a union of boxes. A session may draw from it only if each of
+    /// these boxes is inside one box of one of these sets. `None` for no limit.
     pub(super) draws: Option<Vec<DrawSet>>,
     /// A session may not draw from a region that overlaps any of these sets.
     pub(super) never: Vec<DrawSet>,

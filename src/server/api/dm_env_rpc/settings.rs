@@ -107,8 +107,8 @@ fn ownership(settings: &WorldSettings) -> Result<Ownership, Error> {
 ///
 /// # Errors
 /// If a setting is unknown, of a wrong type, or invalid, e.g. a negative seed or a parameter that is not finite. Also
-/// if a setting is a disturbance with which the world was not created. [`World::change`](super::world::World::change)
-/// checks the bounds of parameters later.
+/// if a setting is a disturbance, but the world was created without disturbances.
+/// [`World::change`](super::world::World::change) checks the bounds of parameters later.
 pub(super) fn change(
     spec: &'static EnvironmentSpec,
     request: &'static str,
