@@ -76,7 +76,7 @@ pub enum ClientError {
          the same files of the task, and restart them"
     )]
     Models { first: Address, other: Address, environment: String, hashes: Box<[String; 2]> },
-    /// The server has no environment with the name or revision.
+    /// The server has no environment with the requested name, or another revision of it than the requested one.
     #[error(transparent)]
     NoEnvironment(#[from] UnknownEnvironment),
     /// The server does not know [`Open::observe_parameters`](crate::proto::Open::observe_parameters).

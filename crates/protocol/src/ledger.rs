@@ -90,8 +90,8 @@ pub struct DrawRecord {
     pub ends: Vec<DrawEnd>,
 }
 
-/// Environments that begin to draw from a region. The seed, the environment's index and the episode's number determine
-/// each episode's random numbers.
+/// Environments that begin to draw from a region. The random numbers of an episode follow from the seed, the
+/// environment's index and a number: the trial's number for the parameters, the episode's number for everything else.
 ///
 /// It is serialised as an array of its fields, in order. Older servers wrote it as an object, which can also be read.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Deserialize)]

@@ -305,7 +305,7 @@ mod tests {
     }
 
     #[rstest]
-    #[case::not_toml("[[token]]\nname =", 2, "cannot be read")]
+    #[case::not_toml("[[token]]\nname =", 2, "not valid TOML")]
     #[case::unknown_key("# a\n[[token]]\nname = \"ann\"\ntokn = \"x\"", 4, "unknown field `tokn`")]
     #[case::no_name("[[token]]\ntoken = \"correct-horse-battery\"", 1, "missing field `name`")]
     #[case::neither("\n\n[[token]]\nname = \"ann\"", 3, "neither")]
@@ -313,11 +313,11 @@ mod tests {
     #[case::no_digest("[[token]]\nname = \"ann\"\nsha256 = \"correct-horse-battery\"", 1, "64 hexadecimal")]
     #[case::short(&file("correct-horse", ""), 1, "fewer than 16")]
     #[case::spaces(&file("correct horse battery", ""), 1, "visible")]
-    #[case::no_number(&file(SECRET, "max_envs = \"correct-horse-battery\""), 4, "cannot be read")]
+    #[case::no_number(&file(SECRET, "max_envs = \"correct-horse-battery\""), 4, "a value is invalid")]
     #[case::empty(&file(SECRET, "max_envs = 0"), 1, "leave the token out")]
     #[case::no_bytes(&file(SECRET, "max_bytes = 0"), 1, "leave the token out")]
     #[case::no_steps(&file(SECRET, "max_steps_per_second = 0"), 1, "leave the token out")]
-    #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "cannot be read")]
+    #[case::too_many_steps(&file(SECRET, "max_steps_per_second = 5000000000"), 4, "a value is invalid")]
     #[case::twice(&(file(SECRET, "") + &file("another-horse-battery", "")), 4, "two tokens called \"ann\"")]
     #[case::shared(&(file(SECRET, "") + &file(SECRET, "").replace("ann", "bob")), 4, "of another entry")]
     fn invalid_file_is_refused_with_line_but_not_token(#[case] text: &str, #[case] line: usize, #[case] part: &str) {

@@ -2,11 +2,11 @@
 
 use super::Watched;
 use crate::{
-    acting::game::{Game, PLAIN},
+    acting::game::{Game, PLAIN, play},
     common::server::{Session, channel, client, environment, open, within},
     dm_env_rpc::client::{self as worlds, Agent},
 };
-use perturb::proto::{Open, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
+use perturb::proto::{Act, Open, Release, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
 use std::path::Path;
 use tonic::Code;
 
@@ -245,4 +245,26 @@ async fn metrics_are_described_and_have_all_environments() {
     for environment in perturb::tasks::catalogue().names() {
         assert!(page.tells(&format!("perturb_steps_total{{environment=\"{environment}\"}}")), "{environment}");
     }
+}
+
+#[tokio::test]
+async fn memory_of_a_policy_is_reserved_until_the_policy_is_discarded() {
+    const SERIES: &str = "perturb_in_flight_bytes";
+    let watched = Watched::start(&[]);
+    let game = Game { n: 64, ..PLAIN };
+    let (mut session, environment) = game.session(&watched.server).await;
+    // A step ends the reservations of the first reply.
+    session.step(vec![0; 4 * 64].into()).await;
+    let open = watched.page().number(SERIES);
+    let act = game.act(&environment, Task::Steps(3));
+    // The weights count as received and as loaded. Each environment has activations of the layers of 9 and 7 units.
+    let policy = (2 * act.weights.len() + 64 * (9 + 7) * 16) as f64;
+    let weights = act.weights.clone();
+    play(&mut session, act).await;
+    watched.until(SERIES, open + policy).await;
+    play(&mut session, Act { weights, task: Some(Task::Steps(3)), ..Act::default() }).await;
+    watched.until(SERIES, open + policy).await;
+    let mask = [vec![1], vec![0; 63]].concat().into();
+    session.ask(Release { mask }).await;
+    watched.until(SERIES, open).await;
 }
