@@ -509,7 +509,7 @@ def locomotion(studies):
 
 
 def margin(studies, numbers):
-    """Return the least difference of the metrics from the paper's averages of A2C, the paper's best method."""
+    """Return the least difference of the metrics from the averages of the paper's feed-forward A2C."""
     return min(number - studies.paper_mean(FF["a2c"], metric) for number, metric in zip(numbers, METRICS, strict=True))
 
 
