@@ -64,7 +64,7 @@ def test_ppo_in_one_file_learns_cart_pole(server: str) -> None:
     assert returns[0] < 100, returns
 
 
-def test_report_shows_the_agent_and_its_checkpoint_gives_the_same_bytes(server: str, tmp_path: Path) -> None:
+def test_report_shows_the_agent_and_checkpoint_gives_same_bytes(server: str, tmp_path: Path) -> None:
     from stable_baselines3 import PPO
 
     lines = [line for line in (EXAMPLES / "sb3_report.py").read_text().splitlines() if line]

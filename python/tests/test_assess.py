@@ -111,7 +111,7 @@ def test_python_and_the_program_give_the_same_records(checkpoint: Path, tmp_path
     ],
     ids=["rc", "rc-continuous-sees-parameters", "rl2", "random"],
 )
-def test_python_and_the_program_agree_on_recurrent_and_random_policies(
+def test_python_and_program_agree_on_recurrent_and_random_policy(
     environment: str, settings: list[str], tmp_path: Path, server: str
 ) -> None:
     out = tmp_path / "run"
@@ -197,7 +197,7 @@ def test_a_function_with_memory_is_told_where_episodes_begin(server: str) -> Non
     same_episodes(assessment, again)
 
 
-def test_random_functions_are_seeded_and_numpys_state_is_restored(server: str) -> None:
+def test_random_functions_are_seeded_and_numpy_state_is_restored(server: str) -> None:
     def guesses(observations: Any) -> Any:
         return np.random.randint(2, size=len(observations))
 

@@ -237,7 +237,7 @@ def test_a_full_server_names_its_limit(start_server: Callable[..., Any]) -> None
         perturb.PerturbEnv("CartPole", server=address).reset()
 
 
-def test_error_of_a_too_large_message_names_the_flag_of_the_limit(start_server: Callable[..., Any]) -> None:
+def test_error_of_a_too_large_message_names_the_limits_flag(start_server: Callable[..., Any]) -> None:
     address = start_server("--max-message-bytes", "1024").address
     envs = perturb.PerturbVectorEnv("CartPole", 500, server=address)
     envs.reset()

@@ -146,7 +146,7 @@ def test_saved_assessments_are_compared_without_another_test(
     assert comparison.verdict in output, "the program prints the same verdict"
 
 
-def test_rows_of_a_results_table_are_compared_by_their_numbers_of_successes() -> None:
+def test_rows_of_results_tables_are_compared_by_successes() -> None:
     pd = pytest.importorskip("pandas")
     results = perturb.read_results(ROOT / "results/results.parquet")
     rows = results[(results.study == "classic-ff") & (results.environment == "CartPole") & (results.seed > 1)]

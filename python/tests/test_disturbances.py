@@ -118,7 +118,7 @@ def test_infos_and_observations_contain_disturbances(server: str) -> None:
     environment.close()
 
 
-def test_adding_disturbances_to_an_existing_environment_is_refused_with_a_remedy(server: str) -> None:
+def test_adding_disturbances_to_an_environment_is_refused(server: str) -> None:
     environment: Any = gym.make("perturb/Pendulum-v1", server=server).unwrapped
     with pytest.raises(perturb.InvalidArgumentError, match="where it is made"):
         environment.set_parameters({"action_delay": 1})

@@ -51,7 +51,7 @@ def test_batch_equals_that_of_a_private_server_to_the_last_bit(mode: AutoresetMo
         batch.close()
 
 
-def test_environment_equals_that_of_a_private_server_to_the_last_bit() -> None:
+def test_environment_equals_that_of_a_private_server() -> None:
     environments = [perturb.PerturbEnv("CartPole", version="E", server=server) for server in (None, "embedded")]
     for episode in range(3):
         assert same(*(one.reset(seed=7 if episode == 0 else None) for one in environments))
@@ -83,7 +83,7 @@ def physics_threads() -> int:
     return sum(name.read_text().startswith("physics-") for name in names)
 
 
-def test_threads_of_an_embedded_server_end_with_its_last_environment() -> None:
+def test_threads_of_embedded_servers_end_with_last_environment() -> None:
     environments = [perturb.PerturbEnv("CartPole", server="embedded") for _ in range(2)]
     assert physics_threads() == 0, "nothing is started before a reset"
     for one in environments:
@@ -183,7 +183,7 @@ def test_a_lost_session_does_not_wait_for_a_server_that_starts(monkeypatch: pyte
     environment.close()
 
 
-def test_release_without_wait_does_nothing_while_the_lock_is_held() -> None:
+def test_release_without_wait_does_nothing_while_lock_is_held() -> None:
     server = local_server.acquire(EmbeddedServer)
     users = server.users
     with local_server._lock:

@@ -101,7 +101,7 @@ def test_a_copied_batch_plays_the_same_episodes_after_a_reset(server: str) -> No
 
 
 @pytest.mark.parametrize("version", ["x", "RE", "", None, 1, ["R"]])
-def test_wrong_versions_are_refused_with_the_same_words_everywhere(version: Any) -> None:
+def test_wrong_versions_have_the_same_error_everywhere(version: Any) -> None:
     words = "none of 'D'"
     with pytest.raises(perturb.InvalidArgumentError, match=words):
         perturb.PerturbEnv("CartPole", version=version)

@@ -25,7 +25,7 @@ def run(*command: str) -> str:
     return ended.stdout
 
 
-def test_the_example_of_ten_lines_runs_and_equals_that_in_the_readme() -> None:
+def test_example_of_ten_lines_runs_and_equals_the_readme() -> None:
     output = run("ten_lines.py")
     assert output.startswith("frictions: [")
     assert "ended:" in output

@@ -384,7 +384,7 @@ def test_private_server_ends_with_last_environment() -> None:
     assert not directory.exists()
 
 
-def test_private_server_ends_if_its_environment_is_garbage_collected() -> None:
+def test_private_server_ends_if_environment_is_garbage_collected() -> None:
     env = perturb.PerturbEnv("CartPole")
     env.reset()
     shared = private()
@@ -534,7 +534,7 @@ def test_a_program_that_is_not_a_server_is_reported(monkeypatch: pytest.MonkeyPa
         perturb.PerturbEnv("CartPole").reset()
 
 
-def test_variables_for_other_servers_do_not_affect_private_servers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_private_servers_ignore_variables_for_other_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PERTURB_SERVER_WORKERS", "0")  # a server with this setting does not start
     envs = perturb.PerturbVectorEnv("CartPole", 20_000)  # more environments than the default limit of a server
     envs.reset()

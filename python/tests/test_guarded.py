@@ -253,7 +253,7 @@ def test_a_unix_socket_needs_no_credentials(have: Callable[[Files], None], serve
         env.close()
 
 
-def test_versions_and_parameters_that_a_role_excludes_are_refused(guarded: str, have: Callable[[Files], None]) -> None:
+def test_versions_and_parameters_excluded_by_a_role_are_refused(guarded: str, have: Callable[[Files], None]) -> None:
     have(ALL)
     settings: list[dict[str, Any]] = [{"version": "E"}, {"version": "R+E"}, EXTREME]
     for wrong in settings:

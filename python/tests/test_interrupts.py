@@ -46,7 +46,7 @@ def interrupting(envs: perturb.PerturbVectorEnv) -> Iterator[None]:
         signal.signal(signal.SIGUSR1, before)
 
 
-def test_a_reset_does_not_receive_the_reply_to_an_interrupted_step(start_server: Callable[..., Any]) -> None:
+def test_reset_does_not_receive_the_reply_to_an_interrupted_step(start_server: Callable[..., Any]) -> None:
     running = start_server()
     envs = perturb.PerturbVectorEnv("Hopper", 4, server=running.address)
     expected = envs.reset(seed=2)[0].tobytes()

@@ -46,7 +46,7 @@ def test_observed_parameters_are_in_observation_and_space(entry: dict[str, Any],
     plain.close()
 
 
-def test_observations_of_a_batch_end_with_the_parameters_of_each_episode(server: str) -> None:
+def test_batches_observe_the_parameters_of_each_episode(server: str) -> None:
     entry = ENTRIES[0]
     settings: dict[str, Any] = {"version": "R", "autoreset_mode": "SameStep", "server": server}
     envs = gymnasium.make_vec(identifier(entry["name"]), num_envs=4, observe="parameters", **settings)

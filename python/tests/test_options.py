@@ -125,7 +125,7 @@ def test_parameters_of_a_reset_also_apply_to_later_resets(server: str) -> None:
     assert first["parameters"]["force"] != second["parameters"]["force"]
 
 
-def test_a_trial_of_r_plus_e_draws_all_parameters_from_the_same_version(server: str) -> None:
+def test_trial_of_r_plus_e_draws_parameters_from_one_version(server: str) -> None:
     envs = make_vec(num_envs=60, version="R+E", server=server)
     parameters = envs.reset(seed=4)[1]["parameters"]
     of_r = [

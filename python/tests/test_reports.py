@@ -42,7 +42,7 @@ def test_a_report_without_an_experiment_shows_only_the_agent(assessment: perturb
     assert page.count("training steps: not known") == 2
 
 
-def test_a_report_beside_an_experiment_has_the_agent_in_its_tables(
+def test_report_with_an_experiment_has_the_agent_in_its_tables(
     assessment: perturb.Assessment, tmp_path: Path, server: str
 ) -> None:
     assessment.save(tmp_path / "saved")

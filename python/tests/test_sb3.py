@@ -151,7 +151,7 @@ def test_settings_that_stable_baselines3_needs_cannot_be_changed(server: str) ->
         make_vec_env("CartPole", server=server, version="x")
 
 
-def test_evaluate_policy_of_stable_baselines3_accepts_the_environments(server: str) -> None:
+def test_sb3_evaluate_policy_accepts_the_environments(server: str) -> None:
     from stable_baselines3.common.evaluation import evaluate_policy
 
     model = trained(server, 1024)

@@ -52,7 +52,7 @@ def test_sets_of_experiment_files_equal_sets_made_in_python(tmp_path: Path) -> N
     assert perturb.sets.grid("one", {"length": 0.5}).contexts == ({"length": 0.5},)
 
 
-def test_python_and_the_program_record_the_same_episodes_on_a_grid(tmp_path: Path, server: str) -> None:
+def test_python_and_program_record_the_same_episodes_on_a_grid(tmp_path: Path, server: str) -> None:
     own = ["--parameters", "length=0.8..1.2/3", "mass=1"]
     evaluated(PENDULUM, tmp_path / "records", server, "--episodes", "20", *own)
     points = perturb.sets.grid("parameters", {"length": "0.8..1.2/3", "mass": 1})

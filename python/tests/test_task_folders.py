@@ -41,7 +41,7 @@ def steps(env: Any, count: int = 5) -> list[bytes]:
     return observed + [env.step(action)[0].tobytes() for _ in range(count)]
 
 
-def test_an_environment_is_made_by_id_by_name_or_from_the_folder_alone(tmp_path: Path) -> None:
+def test_environment_is_made_by_id_by_name_or_from_the_folder(tmp_path: Path) -> None:
     walker = perturb.tasks.from_gymnasium("Walker2d-v5", tmp_path / "walker2d")
     env = gymnasium.make("perturb/Walker2dV5-v0", task=walker, version="R")
     assert env.observation_space.shape == (17,)
@@ -162,7 +162,7 @@ def test_the_tasks_of_a_running_server_need_no_folder(start_server: Callable[...
         perturb.PerturbEnv("Walker2dV5", server=running.address)
 
 
-def test_the_example_equals_the_arm_of_the_tutorial_and_has_policies() -> None:
+def test_example_equals_the_tutorials_arm_and_has_policies() -> None:
     """The example's files equal those in the tutorial, so the tutorial's result tables also hold for the example."""
     example = ROOT / "examples/tasks/my_arm"
     tutorial = (ROOT / "docs/tutorials/your-robot.md").read_text()

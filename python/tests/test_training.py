@@ -44,7 +44,7 @@ def test_a_training_gives_policy_log_and_result(tmp_path: Path, server: str) -> 
     assert again.policy.id == trained.policy.id, "the same seed, the same weights"
 
 
-def test_errors_contain_the_reasons_for_which_the_program_refuses(tmp_path: Path, server: str) -> None:
+def test_errors_contain_the_reason_of_the_program(tmp_path: Path, server: str) -> None:
     with pytest.raises(perturb.InvalidArgumentError, match="Cart"):
         perturb.train("Cart", episodes=1, out=tmp_path / "run", server=server)
     with pytest.raises(perturb.InvalidArgumentError, match="learning_rat"):
@@ -59,7 +59,7 @@ def test_error_says_how_to_get_a_missing_program(monkeypatch: pytest.MonkeyPatch
         perturb.train("CartPole", episodes=1)
 
 
-def test_example_policies_succeed_on_d_and_the_one_of_d_often_fails_on_r(server: str) -> None:
+def test_example_policies_succeed_on_d_and_one_often_fails_on_r(server: str) -> None:
     assessment = perturb.evaluate(perturb.example_policies(), "Hopper", episodes=100, seed=1, server=server)
     rate = {result.scenario: result.success_percent for result in assessment.results}
     assert min(rate["DD"], rate["RD"]) > 85, rate

@@ -321,11 +321,7 @@ mod tests {
     #[case(2, 64, 64)]
     #[case(64, 64, 2)]
     #[case::nothing_to_do(0, 2, 2)]
-    fn private_servers_share_two_threads_for_each_core_or_have_one_each(
-        #[case] jobs: usize,
-        #[case] cores: usize,
-        #[case] each: usize,
-    ) {
+    fn private_servers_share_threads_or_have_one_each(#[case] jobs: usize, #[case] cores: usize, #[case] each: usize) {
         assert_eq!(workers_of_each(jobs, cores), each);
     }
 }

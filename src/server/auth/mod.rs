@@ -293,7 +293,7 @@ mod tests {
     }
 
     #[test]
-    fn a_token_is_found_whether_its_entry_has_the_text_or_the_digest() {
+    fn a_token_is_found_by_its_text_or_digest() {
         let (token, entry) = new_token("bob \"the\" builder").unwrap();
         let tokens = tokens_of(&(entry + &file(SECRET, ""))).unwrap();
         let name = |shown: &str| tokens.find(shown.as_bytes()).map(|token| token.name().to_owned());

@@ -162,7 +162,7 @@ mod tests {
     }
 
     #[test]
-    fn charged_steps_are_waited_for_and_an_idle_client_may_run_a_burst() {
+    fn charged_steps_are_waited_for_and_idle_clients_may_burst() {
         let mut clocked = Clocked::new();
         clocked.state.done += 1e6;
         assert_eq!(clocked.turn(), Ok(0.0), "there is no rate");

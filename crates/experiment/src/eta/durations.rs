@@ -64,7 +64,7 @@ mod tests {
     use crate::Timing;
 
     #[test]
-    fn durations_of_finished_cells_are_averaged_by_environment_and_method() {
+    fn durations_are_averaged_by_environment_and_method() {
         let text = "environments = ['CartPole', 'Hopper']\nversions = ['D']\nruns = 3
             [[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
         let plan = Plan::parse("test", text.into()).unwrap();

@@ -111,7 +111,7 @@ mod tests {
     }
 
     #[test]
-    fn running_cells_predict_waiting_cells_of_their_environment_and_method() {
+    fn running_cells_predict_waiting_cells_of_same_method() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let [cart_pole, cart_pole_2, hopper, hopper_2] = &plan.cells[..] else { panic!() };
         let times = CellDurations::default();
@@ -125,7 +125,7 @@ mod tests {
     }
 
     #[test]
-    fn measured_maxima_are_used_for_methods_without_running_or_finished_cells() {
+    fn measured_maxima_are_used_for_methods_without_begun_cells() {
         let plan = Plan::parse("test", PLAN.into()).unwrap();
         let waits = |max_seconds| UnfinishedCell {
             cell: &plan.cells[3],

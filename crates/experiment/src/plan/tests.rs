@@ -171,7 +171,7 @@ fn r_plus_e_is_a_version_and_keeps_other_ids() {
 }
 
 #[test]
-fn selection_needs_several_configurations_of_one_method_in_one_environment() {
+fn selection_needs_several_configurations_of_one_method() {
     let each = "environments = ['CartPole', 'Pendulum']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']";
     let two = format!(
         "{each}\nenvironments = ['CartPole']\n[[algorithm]]\nname = 'a2c'\narchitectures = ['ff']\n\
