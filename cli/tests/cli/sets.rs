@@ -268,7 +268,7 @@ fn unknown_parameters_are_refused_at_the_start() {
         ("CartPole = 'steps", "CartPool = 'steps", "`CartPool`, but must be one of CartPole"),
         ("length = '0.7..0.8,0.9..1.0'\nmass = 0.2", "version = 'R'", "without parameters"),
         ("test_versions = ['E'", "test_versions = ['X'", "`X`"),
-        ("rows.csv", "../rows.csv", "not the name of a file"),
+        ("rows.csv", "../rows.csv", "not the name of a .csv file"),
     ] {
         std::fs::write(directory.path().join("plan.toml"), PLAN.replace(from, to)).expect("written");
         let output = run(directory.path(), &[]);
