@@ -345,7 +345,7 @@ class NoPolicy:
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        ({"policy": NoPolicy()}, perturb.PolicyError, "expected one of load_policy"),
+        ({"policy": NoPolicy()}, perturb.PolicyError, "expected a policy of load_policy"),
         ({"policy": lambda: 0}, perturb.PolicyError, "requires no arguments; expected actions = f"),
         ({"policy": lambda _a, _b: 0}, perturb.PolicyError, "requires the arguments _a, _b; expected actions = f"),
         ({"policy": lambda _a, _b, _c: 0}, perturb.PolicyError, "gave int; expected a pair"),
@@ -367,7 +367,7 @@ class NoPolicy:
         ({"episodes": 0}, perturb.InvalidArgumentError, "episodes=0"),
         ({"seed": -1}, perturb.InvalidArgumentError, "seed=-1"),
         ({"success": "soon"}, perturb.InvalidArgumentError, "QUANTITY=NUMBER"),
-        ({"success": "distance=1"}, perturb.InvalidArgumentError, "one of steps"),
+        ({"success": "distance=1"}, perturb.InvalidArgumentError, "a threshold for steps"),
         ({"parameters": {"size": 1}}, perturb.UnknownNameError, "no parameter .size."),
         ({"versions": ["D"], "parameters": {"size": 1}}, perturb.InvalidArgumentError, "`size`, but must be one of"),
         ({"parameters": {"length": 1e9}}, perturb.InvalidArgumentError, "within"),
