@@ -133,7 +133,7 @@ def test_a_reply_of_another_kind_is_refused(fake: FakeServer) -> None:
     env.reset()
     with pytest.raises(perturb.ProtocolError, match="answered step with reset"):
         env.step(0)
-    with pytest.raises(perturb.OutOfOrderError, match="has ended"):
+    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to open a new one"):
         env.step(0)
 
 
@@ -201,7 +201,7 @@ def test_a_second_reply_to_one_request_is_refused(fake: FakeServer) -> None:
     time.sleep(0.5)  # meanwhile the keepalive thread polls the session, so the second reply arrives
     with pytest.raises(perturb.ProtocolError, match="a second reply to an earlier request"):
         env.step(0)
-    with pytest.raises(perturb.OutOfOrderError, match="has ended"):
+    with pytest.raises(perturb.OutOfOrderError, match=r"call reset\(\) to open a new one"):
         env.step(0)
 
 

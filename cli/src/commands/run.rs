@@ -43,11 +43,19 @@ pub(super) fn run(args: &RunArgs) -> Result<ExitCode> {
         let message = format!("--out {} holds a training (config.toml): choose another directory", args.out.display());
         return Err(CommandError::Usage(message));
     }
+    let report = args.out.join("report");
+    let is_taken = |page: &Path| {
+        let names = ["report", "cells", "plan.toml"];
+        args.out.starts_with(page) || names.iter().any(|name| page == args.out.join(name))
+    };
+    if let Some(page) = args.html.iter().find(|page| is_taken(page)) {
+        let message = format!("--html {}: the run writes something else there; give another file", page.display());
+        return Err(CommandError::Usage(message));
+    }
     // The run creates --out, the folders above it and the report's folder. So the folder of the --html page need not
     // exist yet if it is one of these.
     let is_created = |page: &Path| {
-        let is_created_folder =
-            |folder: &Path| args.out.starts_with(folder) || folder.starts_with(args.out.join("report"));
+        let is_created_folder = |folder: &Path| args.out.starts_with(folder) || folder.starts_with(&report);
         !page.exists() && page.parent().is_some_and(is_created_folder)
     };
     args.html.iter().filter(|page| !is_created(page)).try_for_each(|page| require_writable(page))?;

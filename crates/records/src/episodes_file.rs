@@ -78,7 +78,8 @@ impl StudyEpisodes {
     }
 
     /// Compares the recorded episodes of `cell` on test set `set` with `replayed`. Returns a description of the first
-    /// episode that differs. Returns `None` if all episodes are equal, or if the file has no episodes of `cell`.
+    /// episode that differs. Does not compare seeds and successes. Returns `None` if no episode differs, or if the file
+    /// has no episodes of `cell`.
     pub fn first_difference(&self, cell: &str, set: &str, replayed: &Records) -> Option<String> {
         let replayed = without_applied(replayed.clone());
         let mut recorded = self.of_cell(cell)?.episodes_on(set);

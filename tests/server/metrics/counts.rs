@@ -2,11 +2,11 @@
 
 use super::Watched;
 use crate::{
-    acting::game::{Game, PLAIN, play},
-    common::server::{Session, channel, client, environment, open, within},
+    acting::game::{Game, PLAIN, play, wire},
+    common::server::{Session, channel, client, environment, open, until, within},
     dm_env_rpc::client::{self as worlds, Agent},
 };
-use perturb::proto::{Act, Open, Release, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
+use perturb::proto::{Act, Open, Policy, Release, act::Task, dm_env_rpc::v1::environment_client::EnvironmentClient};
 use std::path::Path;
 use tonic::Code;
 
@@ -255,7 +255,13 @@ async fn memory_of_a_policy_is_reserved_until_the_policy_is_discarded() {
     let (mut session, environment) = game.session(&watched.server).await;
     // A step ends the reservations of the first reply.
     session.step(vec![0; 4 * 64].into()).await;
-    let open = watched.page().number(SERIES);
+    // The reading is repeated until it is stable, because bytes of the step's reply may still be in flight.
+    let mut open = f64::NAN;
+    until("the bytes in flight are stable", async || {
+        let before = std::mem::replace(&mut open, watched.page().number(SERIES));
+        before == open
+    })
+    .await;
     let act = game.act(&environment, Task::Steps(3));
     // The weights count as received and as loaded. Each environment has activations of the layers of 9 and 7 units.
     let policy = (2 * act.weights.len() + 64 * (9 + 7) * 16) as f64;
@@ -263,6 +269,25 @@ async fn memory_of_a_policy_is_reserved_until_the_policy_is_discarded() {
     play(&mut session, act).await;
     watched.until(SERIES, open + policy).await;
     play(&mut session, Act { weights, task: Some(Task::Steps(3)), ..Act::default() }).await;
+    watched.until(SERIES, open + policy).await;
+    // A policy without hidden layers has no activations.
+    let linear = game.act(&environment, Task::Steps(3));
+    let linear = Act {
+        policy: linear.policy.map(|policy| Policy { hidden: Vec::new(), ..policy }),
+        weights: vec![0; 4 * (2 * 5 + 5)].into(),
+        ..linear
+    };
+    let weights = (2 * linear.weights.len()) as f64;
+    play(&mut session, linear).await;
+    watched.until(SERIES, open + weights).await;
+    // A policy that fails is discarded. These weights give infinite outputs.
+    let failing = game.act(&environment, Task::Steps(3));
+    let failing = Act { weights: wire(&vec![1e38; failing.weights.len() / 4]), ..failing };
+    let (_, words) = session.refused(failing).await;
+    assert!(words.contains("stopped playing the policy"), "{words}");
+    watched.until(SERIES, open).await;
+    // Released environments discard the policy, too.
+    play(&mut session, game.act(&environment, Task::Steps(3))).await;
     watched.until(SERIES, open + policy).await;
     let mask = [vec![1], vec![0; 63]].concat().into();
     session.ask(Release { mask }).await;

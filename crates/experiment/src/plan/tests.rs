@@ -178,7 +178,10 @@ fn selection_needs_several_configurations_of_one_method() {
                        environments = ['Pendulum']\nsettings = {{ n_steps = 9 }}"
     );
     let with_set = format!("versions = ['D', 'mine']\n{each}\n[sets.mine]\nlength = '0.4..0.6'");
-    for (text, selects) in [(SMALL, true), (each, false), (&two, false), (&with_set, false)] {
+    let with_sets_of_two =
+        with_set.replace("architectures = ['ff']", "architectures = ['ff']\ngrid = { n_steps = [5, 9] }");
+    for (text, selects) in [(SMALL, true), (each, false), (&two, false), (&with_set, false), (&with_sets_of_two, true)]
+    {
         assert_eq!(parse(text).unwrap().selects(), selects, "{text}");
     }
 }

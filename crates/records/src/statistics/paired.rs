@@ -73,8 +73,7 @@ mod tests {
     fn pairs_64_apart_have_independent_signs() {
         let signed = |positive: usize, size: f64| (0..64).map(move |i| if i < positive { size } else { -size });
         let differences: Vec<f64> = signed(36, 1.0).chain(signed(40, 0.5)).collect();
-        // The sum is 16, and its standard deviation with random signs is √(64 + 64 / 4) = 8.94: p is near 0.074. If
-        // pairs 64 apart had the same sign, the standard deviation would be 11.7, and p near 0.17.
+        // The sum is 16. The exact p is 0.083. If pairs 64 apart had the same sign, it would be 0.18.
         let p = sign_flip_p(&differences, 1);
         assert!((0.06..0.09).contains(&p), "{p}");
     }

@@ -219,11 +219,18 @@ impl Session {
         let reserve = |bytes: usize| (bytes > 0).then(|| self.budget.reserve(bytes)).transpose();
         let weights_memory = reserve(sizes::weights(&request))?;
         let activations_memory = reserve(sizes::activations(&request, batch.size()))?;
+        let is_new = request.policy.is_some();
         let rollout = policy::rollout_request(batch, self.bearer.as_ref().and_then(|bearer| bearer.rate()), request)?;
         let reservation = self.budget.reserve(sizes::max_rollout_bytes(&rollout, batch))?;
         self.weights_memory = weights_memory.or(self.weights_memory.take());
-        self.activations_memory = activations_memory.or(self.activations_memory.take());
-        let acted = policy::rollout_response(batch.act(rollout).await?);
+        if is_new {
+            self.activations_memory = activations_memory;
+        }
+        let acted = batch.act(rollout).await;
+        if batch.policy_runner().is_none() {
+            (self.weights_memory, self.activations_memory) = (None, None); // the policy failed, and was discarded
+        }
+        let acted = policy::rollout_response(acted?);
         Ok(Reply { memory: Some(reservation), ..reply(Response::Act(acted)) })
     }
 
