@@ -58,7 +58,9 @@ def make_vec_env(
     """
     for name in _FIXED:
         if name in settings:
-            raise InvalidArgumentError(f"{name}= cannot be set here, because stable-baselines3 needs one value; leave it out")
+            raise InvalidArgumentError(
+                f"{name}= cannot be set here, because stable-baselines3 needs one value; leave it out"
+            )
     settings.setdefault("receipts", False)
     batch = PerturbVectorEnv(environment, num_envs, autoreset_mode=AutoresetMode.SAME_STEP, **settings)
     return PerturbVecEnv(batch, seed)
