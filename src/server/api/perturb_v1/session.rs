@@ -228,7 +228,7 @@ impl Session {
         }
         let acted = batch.act(rollout).await;
         if batch.policy_runner().is_none() {
-            (self.weights_memory, self.activations_memory) = (None, None); // the policy failed, and was discarded
+            self.forget_policy(); // the policy failed
         }
         let acted = policy::rollout_response(acted?);
         Ok(Reply { memory: Some(reservation), ..reply(Response::Act(acted)) })
