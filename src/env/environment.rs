@@ -229,6 +229,10 @@ pub trait Environment: Send {
     /// Writes the current observation to `out`, which has the entries of [`EnvironmentSpec::observation`].
     fn observe(&self, out: &mut [f32]);
 
+    /// Draws random numbers of the next step that do not depend on its action, so that the step itself is faster. The
+    /// results of the next step are the same without this call.
+    fn draw_ahead(&mut self) {}
+
     /// Returns the scene to draw for a picture of the current state; `None` after the physics diverged.
     fn scene(&self) -> Option<Scene>;
 

@@ -236,6 +236,11 @@ impl Episodes {
         }
     }
 
+    /// Draws random numbers of the next step before its action is known, see [`Environment::draw_ahead`].
+    pub fn draw_ahead(&mut self) {
+        self.environment.draw_ahead();
+    }
+
     /// Advances the current episode by one step. Writes the terms of the reward to `reward_terms`, in the order of
     /// [`EnvironmentSpec::reward_terms`].
     pub fn step(&mut self, action: Action<'_>, reward_terms: &mut [f64]) -> Outcome {

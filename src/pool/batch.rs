@@ -19,7 +19,7 @@ use super::{
     sync::lock,
 };
 use crate::{
-    env::{Distribution, Draw, EnvironmentSpec, Episodes, StartedEpisode, distributions_bytes},
+    env::{Distribution, Draw, EnvironmentSpec, Episodes, StartedEpisode, distributions_bytes, disturbance},
     meters::Tally,
     scene::Scene,
 };
@@ -78,6 +78,8 @@ pub struct Batch {
     runner: Option<Box<PolicyRunner>>,
     /// Runs when the environments are freed.
     drop_hook: Option<DropHook>,
+    /// Whether environments may have noise, whose random numbers can be drawn ahead.
+    has_noise: bool,
     /// A sender that is dropped when the environments have been freed, for which [`Batch::close`] waits. It must be the
     /// last field, because fields are dropped in order.
     freed: Option<oneshot::Sender<()>>,
@@ -104,6 +106,7 @@ impl Batch {
         let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
         let shards = parts.map(shard).collect();
         let job = job(&settings, shards, pool.workers(), owned, size);
+        let has_noise = disturbance::has_noise(settings.spec);
         let mut batch = Self {
             settings,
             size,
@@ -117,6 +120,7 @@ impl Batch {
             pipelined_since: None,
             runner: None,
             drop_hook: None,
+            has_noise,
             freed: None,
         };
         batch.run().await?;
@@ -182,6 +186,17 @@ impl Batch {
             }
             None => Ok(self.step_result(start, end.unwrap_or_else(Instant::now))),
         }
+    }
+
+    /// Whether [`Batch::draw_ahead`] can make the next step faster. It cannot if the workers run the steps.
+    pub fn draws_ahead(&self) -> bool {
+        self.has_noise && !self.is_running && !self.job.needs_workers()
+    }
+
+    /// Draws the random numbers of the next step's noise on the calling thread. Call this method while the session waits
+    /// for a request, if [`Batch::draws_ahead`] is true. Results do not depend on it.
+    pub fn draw_ahead(&mut self) {
+        self.job.shards.iter().for_each(|shard| lock(shard).draw_ahead());
     }
 
     /// Gathers the result of the step that ran from `start` to `end`.

@@ -176,6 +176,11 @@ impl Shard {
         self.slots.iter().map(Episodes::draw)
     }
 
+    /// Has every environment draw random numbers of its next step before its action is known.
+    pub(super) fn draw_ahead(&mut self) {
+        self.slots.iter_mut().for_each(Episodes::draw_ahead);
+    }
+
     /// The scene to draw of the environment in a slot. `slot` counts from the first slot of the batch.
     pub(super) fn scene(&self, slot: usize) -> Option<Scene> {
         self.slots[slot - self.first_slot].scene()

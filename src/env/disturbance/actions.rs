@@ -1,6 +1,6 @@
 //! Disturbs actions: delay, repetition (`action_hold`), noise and scale.
 
-use super::{finite, next_offset, parameters::DisturbanceValues};
+use super::{finite, next_offset, noise::NoiseAhead, parameters::DisturbanceValues};
 use crate::env::{Action, ActionSpec, Draw, DrawPurpose, Error, PhiloxStream};
 use std::mem::replace;
 
@@ -19,13 +19,15 @@ pub(super) struct ActionPath {
     /// The continuous action of the current step after noise and scale, `[A]`, as the physics receive it. Not used for
     /// discrete actions.
     acting: Vec<f32>,
+    noise: NoiseAhead,
 }
 
 impl ActionPath {
     /// Creates the path for actions of `space`. `neutral` is the environment's action with the least effect, `[A]`.
     pub(super) fn new(space: ActionSpec, neutral: Vec<f32>) -> Self {
         let (held, acting) = (neutral.clone(), neutral.clone());
-        Self { space, neutral, delayed: Vec::new(), oldest: 0, held, acting }
+        let noise = NoiseAhead::new(DrawPurpose::ActionNoise, neutral.len());
+        Self { space, neutral, delayed: Vec::new(), oldest: 0, held, acting, noise }
     }
 
     /// Begins an episode. The neutral action acts until the client's first action arrives.
@@ -36,6 +38,13 @@ impl ActionPath {
         }
         self.oldest = 0;
         self.held.copy_from_slice(&self.neutral);
+    }
+
+    /// Draws the noise on the action of step number `step`, before the client's action is known.
+    pub(super) fn draw_ahead(&mut self, values: &DisturbanceValues, draw: &Draw, step: u32) {
+        if values.action_noise > 0.0 && matches!(self.space, ActionSpec::Continuous(_)) {
+            self.noise.draw(draw, step);
+        }
     }
 
     /// Takes the client's action for step number `step`, counted from 0. Returns the disturbed action for the physics.
@@ -65,8 +74,7 @@ impl ActionPath {
                 Action::Discrete(self.held[0] as u32)
             }
             (Action::Continuous(action), ActionSpec::Continuous(channels)) => {
-                let mut noise =
-                    (values.action_noise > 0.0).then(|| PhiloxStream::at_step(draw, DrawPurpose::ActionNoise, step));
+                let mut numbers = (values.action_noise > 0.0).then(|| self.noise.at_step(draw, step));
                 for (i, (&action, channel)) in action.iter().zip(channels).enumerate() {
                     let arrived = self.delayed.get_mut(oldest + i).map_or(action, |place| replace(place, action));
                     if !is_held {
@@ -74,8 +82,8 @@ impl ActionPath {
                     }
                     // Noise and scale change only `acting`, so a repeated action gets new noise.
                     let mut acting = self.held[i];
-                    if let Some(stream) = &mut noise {
-                        let [normal] = stream.normals();
+                    if let Some(numbers) = &mut numbers {
+                        let [normal] = numbers.next();
                         let noise = values.action_noise * (channel.high - channel.low) * normal;
                         acting = finite(f64::from(acting) + noise);
                     }

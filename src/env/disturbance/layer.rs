@@ -112,6 +112,11 @@ impl Environment for Disturbed {
         self.sensors.observe(&self.values, &self.draw, self.steps, out);
     }
 
+    fn draw_ahead(&mut self) {
+        self.actions.draw_ahead(&self.values, &self.draw, self.steps);
+        self.sensors.draw_ahead(&self.values, &self.draw, self.steps + 1);
+    }
+
     fn scene(&self) -> Option<Scene> {
         self.physics.environment.scene()
     }

@@ -7,11 +7,13 @@
 //!
 //! - `parameters` defines the disturbances of an environment and their values.
 //! - `layer` is the twin. It passes actions through `actions` to the physics, and observations through `sensors` back.
+//! - `noise` draws the random numbers of noise, also ahead of the step.
 //! - `changes` holds the physics, which may change within an episode.
 
 mod actions;
 mod changes;
 mod layer;
+mod noise;
 mod parameters;
 mod sensors;
 
@@ -64,6 +66,11 @@ pub fn disturbed(spec: &'static EnvironmentSpec) -> &'static EnvironmentSpec {
 pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     let twins = TWINS.lock().unwrap_or_else(PoisonError::into_inner);
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
+}
+
+/// Whether the actions or observations of an environment may have noise.
+pub fn has_noise(spec: &EnvironmentSpec) -> bool {
+    spec.parameters.iter().any(|parameter| parameter.name == parameters::SENSOR_NOISE)
 }
 
 /// Returns the environment that has parameters with these names: the disturbed twin if one of the names is a

@@ -1,6 +1,10 @@
 //! Disturbs observations: delay, noise and dropout.
 
-use super::{finite, next_offset, parameters::DisturbanceValues};
+use super::{
+    finite, next_offset,
+    noise::{NoiseAhead, NoiseNumbers},
+    parameters::DisturbanceValues,
+};
 use crate::env::{ChannelSpec, Draw, DrawPurpose, Error, PhiloxStream};
 
 /// Disturbs the observations of one environment on their way to the policy. O is the length of an observation.
@@ -11,12 +15,14 @@ pub(super) struct SensorPath {
     exact: Vec<f32>,
     /// The index in `exact` of the first number of the newest observation.
     newest: usize,
+    noise: NoiseAhead,
 }
 
 impl SensorPath {
     /// Creates the path for observations whose entries are `channels`.
     pub(super) fn new(channels: &'static [ChannelSpec]) -> Self {
-        Self { channels, exact: vec![0.0; channels.len()], newest: 0 }
+        let noise = NoiseAhead::new(DrawPurpose::SensorNoise, channels.len());
+        Self { channels, exact: vec![0.0; channels.len()], newest: 0, noise }
     }
 
     /// Begins an episode. The callback `observe` writes the first exact observation. The policy sees this observation,
@@ -38,6 +44,13 @@ impl SensorPath {
         observe(&mut self.exact[self.newest..][..width]);
     }
 
+    /// Draws the noise on the observation after `steps` steps of the episode, before this observation exists.
+    pub(super) fn draw_ahead(&mut self, values: &DisturbanceValues, draw: &Draw, steps: u32) {
+        if values.sensor_noise > 0.0 {
+            self.noise.draw(draw, steps);
+        }
+    }
+
     /// Writes the observation that the policy sees after `steps` steps of the episode to `out`, `[O]`: the oldest
     /// observation in the ring buffer, with noise and dropout.
     pub(super) fn observe(&self, values: &DisturbanceValues, draw: &Draw, steps: u32, out: &mut [f32]) {
@@ -45,15 +58,15 @@ impl SensorPath {
         let oldest = next_offset(self.newest, width, self.exact.len());
         let exact = &self.exact[oldest..][..width];
         if values.sensor_noise > 0.0 {
-            let mut stream = PhiloxStream::at_step(draw, DrawPurpose::SensorNoise, steps);
+            let mut numbers = self.noise.at_step(draw, steps);
             let mut begin = 0;
             while begin < width {
                 let (channels, exact, out) = (&self.channels[begin..], &exact[begin..], &mut out[begin..]);
                 match width - begin {
-                    1 => add_noise::<1>(&mut stream, values.sensor_noise, channels, exact, out),
-                    2 => add_noise::<2>(&mut stream, values.sensor_noise, channels, exact, out),
-                    3 => add_noise::<3>(&mut stream, values.sensor_noise, channels, exact, out),
-                    _ => add_noise::<4>(&mut stream, values.sensor_noise, channels, exact, out),
+                    1 => add_noise::<1>(&mut numbers, values.sensor_noise, channels, exact, out),
+                    2 => add_noise::<2>(&mut numbers, values.sensor_noise, channels, exact, out),
+                    3 => add_noise::<3>(&mut numbers, values.sensor_noise, channels, exact, out),
+                    _ => add_noise::<4>(&mut numbers, values.sensor_noise, channels, exact, out),
                 }
                 begin += 4;
             }
@@ -110,14 +123,14 @@ impl SensorPath {
 /// each entry's scale.
 #[inline]
 fn add_noise<const N: usize>(
-    stream: &mut PhiloxStream,
+    numbers: &mut NoiseNumbers<'_>,
     sensor_noise: f64,
     channels: &[ChannelSpec],
     exact: &[f32],
     out: &mut [f32],
 ) {
     let (channels, exact, out) = (&channels[..N], &exact[..N], &mut out[..N]);
-    let normals = stream.normals::<N>();
+    let normals = numbers.next::<N>();
     for i in 0..N {
         let ChannelSpec { scale, low, high, .. } = channels[i];
         let noisy = f64::from(exact[i]) + sensor_noise * scale * normals[i];

@@ -19,7 +19,10 @@ use crate::server::{
 };
 use perturb_protocol::AdaptiveSpin;
 use std::{convert::Infallible, sync::Arc, time::Duration};
-use tokio::time::{Instant, timeout};
+use tokio::{
+    task::yield_now,
+    time::{Instant, timeout},
+};
 use tonic::Status;
 
 /// The ending of a session that existed only until its stream resumed another session. The access log omits such
@@ -101,12 +104,18 @@ impl<H: SessionHandler> Exchange<H> {
         let limits = self.request_limits();
         let bearer = self.requests.bearer.clone();
         self.was_open = self.handler.is_open();
-        let Self { requests, ahead, was_read_ahead, spin, .. } = self;
+        let Self { requests, ahead, was_read_ahead, spin, handler, .. } = self;
         *was_read_ahead = ahead.is_some();
         let next = async {
             match ahead.take() {
                 Some(request) => request,
-                None => spin.until(requests.next(limits)).await,
+                None => {
+                    if handler.draws_ahead() {
+                        yield_now().await; // the transport sends the last reply first
+                        handler.draw_ahead();
+                    }
+                    spin.until(requests.next(limits)).await
+                }
             }
         };
         let limit = if self.was_open { idle } else { Some(idle.map_or(handshake, |idle| idle.min(handshake))) };

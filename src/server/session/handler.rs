@@ -84,6 +84,14 @@ pub trait SessionHandler: Send + 'static {
         request: Self::Request,
     ) -> impl Future<Output = Result<Reply<Self::Response>, Self::Error>> + Send;
 
+    /// Whether [`draw_ahead`](Self::draw_ahead) can make the next step faster.
+    fn draws_ahead(&self) -> bool {
+        false
+    }
+
+    /// Draws random numbers of the next step while the session waits for its request.
+    fn draw_ahead(&mut self) {}
+
     /// Returns a function that offers the next request to the pool while `request` runs, or `None` if the next request
     /// must wait. A request that was passed to this function must be the next one that the handler answers.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<Self>>;

@@ -74,6 +74,34 @@ fn disturbances_at_their_defaults_change_no_byte() {
 }
 
 #[test]
+fn noise_drawn_ahead_changes_no_byte() {
+    for spec in common::catalogue().specs() {
+        let values = all(spec);
+        let mut plain = disturbed(spec, Version::R, &values, (7, 3));
+        let mut ahead = disturbed(spec, Version::R, &values, (7, 3));
+        for t in 0..400 {
+            if t % 3 > 0 {
+                ahead.draw_ahead();
+            }
+            if t % 50 == 49 {
+                // A snapshot of one episode replaces another episode, for whose next step noise was drawn.
+                let snapshot = ahead.snapshot();
+                ahead.begin(None);
+                ahead.draw_ahead();
+                ahead.restore(&snapshot).unwrap();
+            }
+            assert_eq!(observe(&plain), observe(&ahead), "{} after {t} steps", spec.name);
+            let action = action_bytes(spec, 1, t);
+            assert_eq!(step(&mut plain, &action), step(&mut ahead, &action), "{} at step {t}", spec.name);
+            if plain.ended() {
+                plain.begin(None);
+                ahead.begin(None);
+            }
+        }
+    }
+}
+
+#[test]
 fn disturbances_leave_the_other_draws_alone() {
     for spec in common::catalogue().specs() {
         for version in VERSIONS {

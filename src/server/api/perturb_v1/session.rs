@@ -363,6 +363,16 @@ impl SessionHandler for Session {
         }
     }
 
+    fn draws_ahead(&self) -> bool {
+        self.batch.as_ref().is_some_and(Batch::draws_ahead)
+    }
+
+    fn draw_ahead(&mut self) {
+        if let Some(batch) = &mut self.batch {
+            batch.draw_ahead();
+        }
+    }
+
     /// A step may be pipelined behind another step, if [`Batch::step_queue`] allows it and the token has no rate limit.
     fn pipeline(&self, request: &Self::Request) -> Option<impl FnOnce(Self::Request) + Send + use<>> {
         let batch = self.batch.as_ref().filter(|_| matches!(request.request, Some(Request::Step(_))))?;
