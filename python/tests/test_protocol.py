@@ -24,7 +24,10 @@ Answer = pb.SessionResponse
 
 
 class FakeServer:
-    """A fake server. Each item of `answers` answers one request of a session: a message, or a list of messages."""
+    """A fake server. Each item of `answers` answers one request of a session.
+
+    It is a message, a list of messages, or the text of an error that ends the session.
+    """
 
     def __init__(self, method: str = "Session") -> None:
         self._directory = tempfile.TemporaryDirectory(prefix="perturb-test-")
@@ -41,9 +44,11 @@ class FakeServer:
         self._server.add_insecure_port(self.address)
         self._server.start()
 
-    def _session(self, requests: Iterator[Any], _: grpc.ServicerContext) -> Iterator[Any]:
+    def _session(self, requests: Iterator[Any], context: grpc.ServicerContext) -> Iterator[Any]:
         self.sessions += 1
         for answer, _request in zip(self.answers, requests, strict=False):
+            if isinstance(answer, str):
+                context.abort(grpc.StatusCode.FAILED_PRECONDITION, answer)
             yield from answer if isinstance(answer, list) else [answer]
 
     def end(self) -> None:
@@ -247,6 +252,53 @@ def test_a_stream_that_ends_is_reported(fake: FakeServer) -> None:
     fake.end()
     with pytest.raises(perturb.ServerConnectionError, match="lost the server"):
         env.step(0)
+
+
+# A text that colours a terminal, sets its title, clears it and reverses the direction of text.
+HOSTILE = "hostile \x1b[31mred\x1b]0;title\x07\x9b2J\u202e"
+
+
+def hostile_environment() -> Any:
+    """Return an opened session whose environment has hostile texts."""
+    other = opened()
+    other.environment.parameters.append(pb.Parameter(name=HOSTILE, unit=HOSTILE, default_value=1.0, applied=HOSTILE))
+    other.environment.applied.append(pb.Quantity(name=HOSTILE, unit=HOSTILE))
+    other.environment.model_hash = HOSTILE
+    receipt = pb.Receipt(requested=[1.0], applied=[1.0], model_hash=HOSTILE)
+    other.started.append(pb.EpisodeStart(episode=pb.Episode(), receipt=receipt))
+    return other
+
+
+def reset_and_step(env: perturb.PerturbEnv) -> None:
+    env.reset()
+    env.step(0)
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        [HOSTILE],
+        [Answer(error=pb.Error(code=9, message=HOSTILE))],
+        [Answer(opened=opened()), HOSTILE],
+        [Answer(opened=opened()), Answer(error=pb.Error(code=13, message=HOSTILE))],
+    ],
+    ids=["call", "open", "stream", "step"],
+)
+def test_texts_of_a_hostile_server_are_escaped_in_errors(answers: list[Any], fake: FakeServer) -> None:
+    fake.answers = answers
+    env = perturb.PerturbEnv("CartPole", server=fake.address)
+    with pytest.raises(perturb.PerturbError, match=r"hostile \\u\{1b\}\[31mred") as caught:
+        reset_and_step(env)
+    assert str(caught.value).isprintable()
+
+
+def test_names_of_a_hostile_server_are_escaped_in_infos(fake: FakeServer) -> None:
+    fake.answers = [Answer(opened=hostile_environment())]
+    _, info = perturb.PerturbEnv("CartPole", server=fake.address, receipts=True).reset()
+    for values in (info["parameters"], info["receipt"]["applied"]):
+        (name,) = values
+        assert name.startswith(r"hostile \u{1b}[31mred")
+        assert name.isprintable()
 
 
 def test_a_server_of_another_service_is_refused() -> None:

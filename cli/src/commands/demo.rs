@@ -98,8 +98,8 @@ impl Demo<'_> {
             environment.name
         )?;
         let [on_d, on_r] = TRAINED_ON;
-        let (on_d, on_r) = side_by_side(|| self.train(&environment.name, on_d), || self.train(&environment.name, on_r));
-        let trained = [on_d?, on_r?];
+        let train = |version| self.train(&environment.name, version);
+        let trained: [_; 2] = side_by_side(|| train(on_d), || train(on_r))?.into();
         for policy in &trained {
             writeln!(out, "{}", first_result(policy))?;
         }
@@ -120,8 +120,8 @@ impl Demo<'_> {
         }
         writeln!(out, "{}", conclusion(&trained))?;
         let axes = environment.heatmap_axes.clone();
-        let (heatmap, films) = side_by_side(|| self.heatmap(&trained, axes), || self.films(&trained[0].checkpoint));
-        for (what, path) in heatmap?.into_iter().chain(films?) {
+        let (heatmap, films) = side_by_side(|| self.heatmap(&trained, axes), || self.films(&trained[0].checkpoint))?;
+        for (what, path) in heatmap.into_iter().chain(films) {
             writeln!(out, "{what}: {}", path.display())?;
         }
         let seconds = duration(start.elapsed().as_secs_f64());
@@ -280,11 +280,15 @@ fn budget(environment: &str) -> (u64, &'static [&'static str]) {
 
 /// Calls two functions, such as two trainings, in parallel. A single training would leave a core idle, because its
 /// server and its learner work alternately.
-fn side_by_side<A: Send, B: Send>(first: impl FnOnce() -> A + Send, second: impl FnOnce() -> B) -> (A, B) {
+fn side_by_side<A: Send, B>(
+    first: impl FnOnce() -> Result<A> + Send,
+    second: impl FnOnce() -> Result<B>,
+) -> Result<(A, B)> {
     std::thread::scope(|scope| {
-        let first = scope.spawn(first);
+        let first = std::thread::Builder::new().spawn_scoped(scope, first).map_err(system("start a thread"))?;
         let second = second();
-        (first.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic)), second)
+        let first = first.join().unwrap_or_else(|panic| std::panic::resume_unwind(panic));
+        Ok((first?, second?))
     })
 }
 

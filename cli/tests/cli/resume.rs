@@ -299,6 +299,15 @@ fn kill_after(mut child: Child, run: &Path, at_least: u64, delay: Duration) {
     assert_eq!(output.status.code(), None, "it ended before it was killed: {}", stderr(&output));
 }
 
+/// Checks that monitor.csv has only whole lines. Other programs read it as soon as a run was killed.
+#[track_caller]
+fn has_whole_lines(run: &Path) {
+    let text = fs::read_to_string(run.join("monitor.csv")).expect("a file");
+    let (_, table) = text.strip_suffix('\n').and_then(|text| text.split_once('\n')).expect(&text);
+    let commas = |line: &str| line.matches(',').count();
+    assert!(table.lines().all(|line| commas(line) == commas(table.lines().next().unwrap_or_default())), "{text}");
+}
+
 #[test]
 fn a_learner_killed_repeatedly_gives_the_same_bytes() {
     let (local, servers) = servers_of(2);
@@ -317,6 +326,7 @@ fn a_learner_killed_repeatedly_gives_the_same_bytes() {
 
         let child = perturb(&["train", "--config", settings, "--out", path_text]).spawn().expect("perturb");
         kill_after(child, &path, budget / 6, Duration::ZERO);
+        has_whole_lines(&path);
         // A kill while a checkpoint is written can leave such files.
         for stray in
             [".tmp-checkpoint.json", "resume-00999999-0badf00d.safetensors", "weights-00999999-0badf00d.safetensors"]
@@ -326,6 +336,7 @@ fn a_learner_killed_repeatedly_gives_the_same_bytes() {
         let resume = ["train", "--resume", path_text];
         let child = perturb(&[&resume[..], &["--server", &both]].concat()).spawn().expect("perturb");
         kill_after(child, &path, budget / 3, Duration::from_millis(7));
+        has_whole_lines(&path);
         let output = perturb(&[&resume[..], &["--workers", "2"]].concat()).output().expect("perturb runs");
         assert!(output.status.success(), "{}", stderr(&output));
         assert!(stderr(&output).contains(&format!("of {budget} episodes")), "{}", stderr(&output));

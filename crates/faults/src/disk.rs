@@ -31,7 +31,7 @@ pub fn on_full_then_free_disk(command: &Command, folder: &Path, kilobytes: u32, 
 }
 
 /// Returns a command that runs `shell`, with the program and the arguments of `command` appended to its arguments.
-fn in_shell(command: &Command, shell: &mut Command) -> Command {
+pub(crate) fn in_shell(command: &Command, shell: &mut Command) -> Command {
     let mut whole = Command::new(shell.get_program());
     whole.args(shell.get_args()).arg(command.get_program()).args(command.get_args());
     whole.stdout(Stdio::piped()).stderr(Stdio::piped());

@@ -4,9 +4,11 @@
 //! - [`certificates`]: valid and invalid certificates.
 //! - [`rng`]: random faults and pauses from a seed. The seed is printed, so that a failure can be repeated.
 //! - [`disk`]: commands that run with a full disk.
+//! - [`processes`]: commands that run with a limit of processes and threads.
 
 pub mod certificates;
 pub mod disk;
+pub mod processes;
 pub mod proxy;
 pub mod rng;
 

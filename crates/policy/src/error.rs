@@ -55,7 +55,10 @@ pub enum Error {
     #[error("a minibatch is empty, but must have at least 1 sample")]
     NoSamples,
     /// The operating system could not start the threads.
-    #[error("{wanted} threads cannot be started: {reason}; use fewer threads")]
+    #[error(
+        "{wanted} more threads cannot be started: {reason}; use fewer threads, or raise the limit of processes and threads \
+         (`ulimit -u`, in a container pids.max)"
+    )]
     Threads {
         /// Number of threads that were requested.
         wanted: usize,

@@ -2,6 +2,7 @@
 //! aborts the process on some models and never finishes the compilation of others.
 
 use super::error::{LoadError, escaped};
+use perturb_protocol::spawn_failure;
 use rustix::process::{Resource, Rlimit, setrlimit};
 use std::{
     io::{self, Read},
@@ -31,11 +32,13 @@ const MAX_OUTPUT_BYTES: u64 = 1 << 20;
 /// # Errors
 /// [`io::Error`] if the operating system refuses.
 pub fn limit_this_process() -> io::Result<()> {
-    let limit = |resource, most: u64| setrlimit(resource, Rlimit { current: Some(most), maximum: Some(most) });
-    limit(Resource::As, MAX_MEMORY_BYTES)?;
-    limit(Resource::Cpu, MAX_CPU_SECONDS)?;
+    let limit =
+        |resource, soft: u64, hard: u64| setrlimit(resource, Rlimit { current: Some(soft), maximum: Some(hard) });
+    limit(Resource::As, MAX_MEMORY_BYTES, MAX_MEMORY_BYTES)?;
+    // At the soft limit the process gets SIGXCPU, at the hard limit SIGKILL, which may also have other causes.
+    limit(Resource::Cpu, MAX_CPU_SECONDS, MAX_CPU_SECONDS + 1)?;
     // Without this limit, a crash of the process could leave a core file of two gigabytes.
-    limit(Resource::Core, 0)?;
+    limit(Resource::Core, 0, 0)?;
     Ok(())
 }
 
@@ -55,8 +58,17 @@ pub fn check(program: &Path, folder: &Path, measured: bool) -> Result<String, Lo
         .stdout(Stdio::piped())
         .stderr(Stdio::piped())
         .spawn()
-        .map_err(|error| refuse(format!("it could not be loaded in a process of its own: {error}")))?;
-    let (output, complaint) = (collect(child.stdout.take()), collect(child.stderr.take()));
+        .map_err(|error| {
+            refuse(format!("it could not be loaded in a process of its own: {}", spawn_failure(&error)))
+        })?;
+    let [output, complaint] = match (collect(child.stdout.take()), collect(child.stderr.take())) {
+        (Ok(output), Ok(complaint)) => [output, complaint],
+        (Err(error), _) | (_, Err(error)) => {
+            let _ = child.kill(); // fails only if the process has ended
+            let _ = child.wait();
+            return Err(refuse(format!("no thread could read the output of its process: {}", spawn_failure(&error))));
+        }
+    };
     let status = wait(&mut child).map_err(|error| refuse(format!("its process could not be waited for: {error}")))?;
     let words = |reader: thread::JoinHandle<String>| reader.join().unwrap_or_default();
     let (output, complaint) = (words(output), words(complaint));
@@ -119,13 +131,14 @@ fn wait(child: &mut Child) -> io::Result<Option<ExitStatus>> {
 
 /// Starts a thread that reads an output of a process to its end. The thread returns the first [`MAX_OUTPUT_BYTES`]
 /// bytes as text.
-fn collect(stream: Option<impl Read + Send + 'static>) -> thread::JoinHandle<String> {
-    thread::spawn(move || {
+fn collect(stream: Option<impl Read + Send + 'static>) -> io::Result<thread::JoinHandle<String>> {
+    let read = move || {
         let mut kept = Vec::new();
         if let Some(mut stream) = stream {
             let _ = (&mut stream).take(MAX_OUTPUT_BYTES).read_to_end(&mut kept);
             let _ = io::copy(&mut stream, &mut io::sink()); // so that a full pipe does not block the process
         }
         String::from_utf8_lossy(&kept).into_owned()
-    })
+    };
+    thread::Builder::new().spawn(read)
 }

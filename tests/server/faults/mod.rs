@@ -3,6 +3,7 @@
 
 mod clients;
 mod lines;
+mod processes;
 mod requests;
 mod strings;
 

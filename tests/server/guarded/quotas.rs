@@ -224,6 +224,53 @@ async fn opens_and_catalogues_cost_as_much_of_the_rate_as_steps() {
 }
 
 #[tokio::test]
+async fn environments_of_an_open_cost_as_much_as_begun_episodes() {
+    const ENVS: u32 = 100;
+    let guarded = Guarded::without_ledger(&entry("ann", ANN, "max_steps_per_second = 1000"));
+    let mut connection = client(guarded.server.tcp()).await;
+    // 20 opens cost 320 steps, and their environments 2000. An idle token may run one second's steps at once, and no
+    // request waits for the last open.
+    let opens = open_and_end(&mut connection, ENVS, 20).await;
+    assert!(opens.as_secs_f64() > 1.1, "{opens:?}");
+}
+
+#[rstest]
+#[case::create_and_destroy("create", 10)]
+#[case::reset("reset", 60)]
+#[case::reset_world("reset_world", 60)]
+#[case::leave_and_join("join", 90)]
+#[case::property("property", 180)]
+#[tokio::test]
+async fn requests_about_worlds_cost_as_much_of_the_rate_as_steps(#[case] kind: &str, #[case] count: usize) {
+    let guarded = Guarded::without_ledger(&entry("ann", ANN, "max_steps_per_second = 100"));
+    let mut client = EnvironmentClient::new(channel(guarded.server.tcp()).await);
+    let mut agent = Agent::show(&mut client, Some(ANN)).await.unwrap();
+    let settings = || worlds::settings("CartPole", []);
+    let world = agent.create(settings()).await;
+    agent.join(&world).await;
+    let start = Instant::now();
+    for _ in 0..count {
+        match kind {
+            "create" => {
+                let other = agent.create(settings()).await;
+                agent.destroy(&other).await;
+            }
+            "reset" => drop(agent.reset(worlds::Settings::new()).await),
+            "reset_world" => agent.reset_world(&world, worlds::Settings::new()).await,
+            "join" => {
+                agent.leave().await;
+                agent.join(&world).await;
+            }
+            _ => drop(agent.list("").await),
+        }
+    }
+    let took = start.elapsed();
+    // All requests together cost 180 steps. An idle token may run one second's steps at once, and no request waits for
+    // the last request.
+    assert!(took.as_secs_f64() >= 0.7, "{kind}: {took:?}");
+}
+
+#[tokio::test]
 async fn a_rate_bounds_how_fast_the_ledger_grows() {
     const RATE: u64 = 1_000;
     let guarded = Guarded::start(&entry("ann", ANN, &format!("max_steps_per_second = {RATE}")));

@@ -29,11 +29,20 @@ pub fn entry(name: &str, token: &str, more: &str) -> String {
 impl Guarded {
     pub(super) fn start(tokens: &str) -> Self {
         let directory = tempfile::tempdir().unwrap();
+        let ledger = directory.path().join("ledger");
+        Self::with_flags(tokens, directory, &["--ledger", ledger.to_str().unwrap()])
+    }
+
+    /// Starts a server without a ledger. The lines of a ledger would add to the price of requests.
+    pub(super) fn without_ledger(tokens: &str) -> Self {
+        Self::with_flags(tokens, tempfile::tempdir().unwrap(), &[])
+    }
+
+    fn with_flags(tokens: &str, directory: TempDir, flags: &[&str]) -> Self {
         let file = directory.path().join("tokens.toml");
         std::fs::write(&file, tokens).unwrap();
-        let ledger = directory.path().join("ledger");
-        let [tokens, ledger] = [&file, &ledger].map(|path| path.to_str().unwrap());
-        let server = Server::start(&["--tokens", tokens, "--ledger", ledger, "--log", "debug"]);
+        let guard = ["--tokens", file.to_str().unwrap(), "--log", "debug"];
+        let server = Server::start(&[&guard, flags].concat());
         Self { server, directory, file }
     }
 
