@@ -26,7 +26,7 @@ async fn main() -> Result<(), Box<dyn Error>> {
     let renderer = Renderer::new();
     for &(name, state) in SCENES {
         let Ok(spec) = tasks::catalogue().find(name) else { continue }; // built without MuJoCo
-        let distributions = spec.distributions(Version::D);
+        let distributions = spec.distributions(Version::D).into();
         let settings = EpisodeSettings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
         let mut episodes = Episodes::new((spec.make)()?, settings);
         episodes.begin(Some(state));

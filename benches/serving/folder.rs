@@ -235,7 +235,7 @@ impl Bare {
     fn new(spec: &'static EnvironmentSpec, mjcf: &str, external_forces: bool) -> Result<Self, Failure> {
         let episodes = (0..BATCH as u32)
             .map(|environment_index| {
-                let distributions = spec.distributions(Version::D);
+                let distributions = spec.distributions(Version::D).into();
                 let settings = EpisodeSettings { seed: SEED, environment_index, distributions, episodes_per_trial: 1 };
                 Ok(Episodes::new((spec.make)()?, settings))
             })

@@ -158,7 +158,7 @@ struct LocalEnvironments {
 impl LocalEnvironments {
     fn new(spec: &'static EnvironmentSpec, make: MakeRobot, range: Range<usize>) -> Result<Self, Failure> {
         let environment = |index: usize| {
-            let distributions = spec.distributions(Version::D);
+            let distributions = spec.distributions(Version::D).into();
             let settings =
                 EpisodeSettings { seed: SEED, environment_index: index as u32, distributions, episodes_per_trial: 1 };
             Ok(Episodes::new((spec.make)()?, settings))

@@ -10,8 +10,8 @@ use perturb::proto::policy::Role;
 use perturb::proto::session_request::Request;
 use perturb::proto::session_response::Response;
 use perturb::proto::{
-    Act, AutoresetMode, Distribution, Interval, Open, Policy, RandomStream, Release, Render, Reset, SavePlayer,
-    SessionResponse, SlotGroup, Snapshot, Version,
+    Act, AutoresetMode, Contexts, Distribution, Interval, Open, Policy, RandomStream, Release, Render, Reset,
+    SavePlayer, SessionResponse, SlotGroup, Snapshot, Version,
 };
 use perturb::tasks;
 use perturb_checkpoint::Checkpoint;
@@ -112,10 +112,12 @@ fn sessions(environment: &str) -> [Vec<u8>; 3] {
     ];
     let group =
         SlotGroup { size: 2, version: Version::Extreme.into(), parameters: parameters(), ..SlotGroup::default() };
+    let contexts = Contexts { names: vec![parameter.clone()], values: vec![1.0; 2] };
+    let listed = SlotGroup { parameters: [].into(), contexts: Some(contexts), ..group.clone() };
     let groups = framed(Request::Open(Open {
         environment: environment.into(),
         autoreset_mode: AutoresetMode::NextStep.into(),
-        groups: vec![group.clone(), group],
+        groups: vec![group, listed],
         receipts: true,
         reward_terms: true,
         observe_parameters: true,

@@ -3,6 +3,7 @@
 use super::{
     Action, ActionSpec, ChannelSpec, Distribution, Draw, Error, Interval, ParameterSpec, PhiloxStream, QuantitySpec,
     RewardTermSpec, SuccessRuleSpec, Version, shorten,
+    snapshot::{MAX_DISTRIBUTIONS_BYTES, distributions_bytes},
 };
 use crate::scene::Scene;
 use perturb_protocol::region::Region;
@@ -127,17 +128,17 @@ pub fn check_distribution(
 }
 
 /// Replaces the distributions of the parameters that `overrides` names, in each box of the parameter space. `base` has
-/// the distributions of one or two boxes, in the layout of
-/// [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
+/// the layout of [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
 ///
 /// # Errors
-/// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`]. After an error, `base` is unchanged.
+/// [`Error::UnknownParameter`], [`Error::OutOfRange`], [`Error::NotWhole`], and [`Error::TooManyDistributions`] if the
+/// result is too large for a snapshot. After an error, `base` is unchanged.
 pub fn resolve<'a>(
     spec: &'static EnvironmentSpec,
     base: &mut [Distribution],
     overrides: impl IntoIterator<Item = (&'a str, Distribution)>,
 ) -> Result<(), Error> {
-    let mut replaced = Vec::new();
+    let mut replaced: Vec<Option<Distribution>> = vec![None; spec.parameters.len()];
     for (name, distribution) in overrides {
         let position = spec.parameters.iter().position(|p| p.name == name).ok_or_else(|| Error::UnknownParameter {
             environment: spec.name,
@@ -146,10 +147,17 @@ pub fn resolve<'a>(
         })?;
         let parameter = &spec.parameters[position];
         check_distribution(spec, parameter, &distribution)?;
-        replaced.push((position, distribution));
+        replaced[position] = Some(distribution);
     }
-    for (position, distribution) in replaced {
-        base.chunks_exact_mut(spec.parameters.len()).for_each(|of_box| of_box[position] = distribution.clone());
+    let result = base.iter().zip(replaced.iter().cycle()).map(|(old, new)| new.as_ref().unwrap_or(old));
+    let bytes = distributions_bytes(result);
+    if bytes > MAX_DISTRIBUTIONS_BYTES {
+        return Err(Error::TooManyDistributions { environment: spec.name, bytes, most: MAX_DISTRIBUTIONS_BYTES });
+    }
+    for (old, new) in base.iter_mut().zip(replaced.iter().cycle()) {
+        if let Some(new) = new {
+            old.clone_from(new);
+        }
     }
     Ok(())
 }

@@ -5,6 +5,8 @@ use super::{
     observed_parameters::ObservedParameters,
 };
 use crate::scene::Scene;
+use perturb_protocol::limits::MAX_DRAWN_CONTEXTS;
+use std::sync::Arc;
 
 /// The settings that determine the episodes of an environment.
 #[derive(Debug, Clone, PartialEq)]
@@ -14,17 +16,18 @@ pub struct EpisodeSettings {
     /// The environment's index. Seed, index and trial number determine the random numbers for the parameters of a
     /// trial. Seed, index and episode number determine all other random numbers of an episode.
     pub environment_index: u32,
-    /// The distributions of one or two boxes of the parameter space, one box after the other. A box has a distribution
-    /// for each parameter, in the order of [`EnvironmentSpec::parameters`], within the parameters' bounds. Each trial
-    /// draws all parameters from one of the boxes, chosen with equal probability.
-    pub distributions: Vec<Distribution>,
+    /// The distributions of boxes of the parameter space, one box after the other: two for version R+E, one for other
+    /// versions, and this number for each of a session's contexts. A box has a distribution for each parameter, in the
+    /// order of [`EnvironmentSpec::parameters`], within the parameters' bounds. Each trial draws all parameters from one
+    /// of the boxes, chosen with equal probability.
+    pub distributions: Arc<[Distribution]>,
     /// Number of episodes in a trial, at least 1. Parameters are drawn when a trial begins, and kept for all its
     /// episodes.
     pub episodes_per_trial: u32,
 }
 
-/// Maximal number of boxes in [`EpisodeSettings::distributions`]. Version R+E has two.
-pub(super) const MAX_BOXES: usize = 2;
+/// Maximal number of boxes in [`EpisodeSettings::distributions`]. Version R+E has two for each context.
+const MAX_BOXES: usize = 2 * MAX_DRAWN_CONTEXTS;
 
 /// The numbers that identify an episode among all episodes of the same seed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -122,10 +125,12 @@ pub struct Episodes {
     pub(super) observed_parameters: Option<Box<ObservedParameters>>,
 }
 
-/// Returns the number of boxes of the parameter space, 1 or 2, that a list of `distributions` distributions describes.
-/// Each box has `n` distributions, one for each parameter. Returns `None` if the list's length fits neither number.
+/// Returns the number of boxes of the parameter space that a list of `distributions` distributions describes. Each box
+/// has `n` distributions, one for each parameter; without parameters there is one empty box. Returns `None` if the list
+/// has a part of a box, no box, or more than [`MAX_BOXES`].
 pub(super) fn boxes(distributions: usize, n: usize) -> Option<usize> {
-    (1..=MAX_BOXES).find(|boxes| boxes * n == distributions)
+    let boxes = distributions.checked_div(n).unwrap_or(1);
+    (boxes * n == distributions && (1..=MAX_BOXES).contains(&boxes)).then_some(boxes)
 }
 
 impl Episodes {
@@ -177,15 +182,17 @@ impl Episodes {
         self.start(state);
     }
 
-    /// Begins a new trial. `distributions`, if given, replaces the distributions by as many new ones. `seed`, if given,
-    /// replaces the seed and restarts trial and episode numbers at 0. If `state` is given, the first episode begins in
-    /// exactly this state.
-    ///
-    /// # Panics
-    /// If `distributions` has another length than the present distributions.
-    pub fn begin_trial(&mut self, seed: Option<u64>, distributions: Option<&[Distribution]>, state: Option<&[f64]>) {
+    /// Begins a new trial. `distributions`, if given, replaces the distributions; it must have one distribution for each
+    /// parameter in each box. `seed`, if given, replaces the seed and restarts trial and episode numbers at 0. If
+    /// `state` is given, the first episode begins in exactly this state.
+    pub fn begin_trial(
+        &mut self,
+        seed: Option<u64>,
+        distributions: Option<Arc<[Distribution]>>,
+        state: Option<&[f64]>,
+    ) {
         if let Some(distributions) = distributions {
-            self.settings.distributions.clone_from_slice(distributions);
+            self.settings.distributions = distributions;
         }
         self.progress = match seed {
             Some(seed) => {

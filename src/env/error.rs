@@ -79,6 +79,18 @@ pub enum Error {
         /// The interval without whole numbers.
         got: String,
     },
+    /// The distributions of all contexts take more memory than one environment may have.
+    #[error(
+        "the distributions of {environment} take {bytes} bytes; give fewer contexts or intervals, at most {most} bytes"
+    )]
+    TooManyDistributions {
+        /// The environment's name.
+        environment: &'static str,
+        /// The size of the distributions in a snapshot, in bytes.
+        bytes: usize,
+        /// The accepted maximum.
+        most: usize,
+    },
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]
     Snapshot {

@@ -5,7 +5,9 @@ use super::{
     episode::{EpisodeProgress, boxes},
     shorten,
 };
+use perturb_protocol::limits::MAX_INTERVALS;
 use serde::{Deserialize, Serialize};
+use std::sync::Arc;
 
 /// The version of the snapshot format. Every change of [`Saved`], or of the bytes that follow, raises the version.
 const FORMAT: u32 = 3;
@@ -15,15 +17,19 @@ const UNSEALED: u32 = 2;
 /// The first format, which has only [`Saved`]. Later formats append [`EpisodeProgress::held_longest`].
 const FIRST: u32 = 1;
 
+/// Maximal size of distributions in a snapshot, in bytes: the distributions of R and of E for 32 parameters and 76
+/// disturbances, of 64 intervals each. As many bytes hold 1024 contexts of 12 fixed parameters.
+pub(super) const MAX_DISTRIBUTIONS_BYTES: usize = 2 * (32 + 76) * (1 + MAX_INTERVALS * size_of::<(f64, f64)>());
+
 /// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
 ///
-/// - the distributions of R and of E for 32 parameters and 76 disturbances, of 64 intervals each: 216 KiB;
+/// - the distributions: 216 KiB, see [`MAX_DISTRIBUTIONS_BYTES`];
 /// - a state, and an observation of 4096 entries: some 50 KiB;
 /// - delayed actions and observations: 80 KiB.
 pub const MAX_SNAPSHOT_BYTES: usize = 384 << 10;
 
-/// An upper bound of how much a snapshot grows, in bytes, when its counters grow. Large numbers have longer encodings
-/// than small ones.
+/// An upper bound of how much a snapshot grows, in bytes, when its counters and the number of its distributions grow.
+/// Large numbers have longer encodings than small ones.
 const MAX_COUNTERS_GROWTH_BYTES: usize = 64;
 
 /// Maximal episode number in a snapshot. With this limit, the numbers of later episodes do not overflow a u64.
@@ -77,7 +83,7 @@ impl Episodes {
     /// bytes.
     pub(crate) fn max_snapshot_bytes(&self) -> usize {
         let growth = size_of::<f64>() * self.environment.max_saved_growth() + MAX_COUNTERS_GROWTH_BYTES;
-        self.snapshot().len() - distributions_bytes(&self.settings.distributions) + growth
+        self.snapshot().len() - distributions_bytes(&*self.settings.distributions) + growth
     }
 
     /// Restores a snapshot. For the same actions, the environment then gives the same bytes as it gave after the
@@ -105,7 +111,12 @@ impl Episodes {
         self.settings = EpisodeSettings {
             seed: saved.seed,
             environment_index: saved.environment_index,
-            distributions,
+            // Environments of one session mostly share their distributions, also if their snapshots are restored.
+            distributions: if *self.settings.distributions == *distributions {
+                Arc::clone(&self.settings.distributions)
+            } else {
+                distributions.into()
+            },
             episodes_per_trial: saved.episodes_per_trial,
         };
         Ok(())
@@ -129,9 +140,9 @@ impl Episodes {
 }
 
 /// Returns the size of distributions in a snapshot, in bytes, without the number of distributions that precedes them.
-pub(crate) fn distributions_bytes(distributions: &[Distribution]) -> usize {
+pub(crate) fn distributions_bytes<'a>(distributions: impl IntoIterator<Item = &'a Distribution>) -> usize {
     // The number of a distribution's intervals is at most 64, so its encoding takes one byte.
-    distributions.iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
+    distributions.into_iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
 /// The seed, parameter distributions and current parameters of the environment in a snapshot. The server's ledger uses

@@ -51,8 +51,7 @@ pub struct ResetEntry {
     /// A new seed; `None` keeps the seed.
     pub seed: Option<u64>,
     /// New distributions, one for each parameter in each box, in the layout of
-    /// [`EpisodeSettings::distributions`](crate::env::EpisodeSettings::distributions), and as many as before. `None`
-    /// keeps the distributions.
+    /// [`EpisodeSettings::distributions`](crate::env::EpisodeSettings::distributions). `None` keeps the distributions.
     pub distributions: Option<Arc<[Distribution]>>,
     /// An exact initial state, `[S]`, finite; `None` draws the initial state.
     pub state: Option<Vec<f64>>,
@@ -338,8 +337,8 @@ impl Batch {
     }
 
     /// Returns the current distributions of a slot's environment, one for each parameter in each box.
-    pub fn distributions(&self, slot: usize) -> Vec<Distribution> {
-        lock(&self.job.shards[slot / self.shard_size]).distributions(slot).to_vec()
+    pub fn distributions(&self, slot: usize) -> Arc<[Distribution]> {
+        lock(&self.job.shards[slot / self.shard_size]).distributions(slot)
     }
 
     /// Returns the seed, environment index and episode index of the current episode in a slot.
@@ -398,7 +397,7 @@ impl Batch {
     /// restore replaces a distribution by a distribution with more intervals.
     pub fn max_snapshot_bytes(&self) -> usize {
         let own = lock(&self.job.shards[0]).max_snapshot_bytes();
-        let distributions = |group: &SlotGroupSettings| distributions_bytes(&group.episodes.distributions);
+        let distributions = |group: &SlotGroupSettings| distributions_bytes(&*group.episodes.distributions);
         let largest = self.settings.groups.iter().map(distributions).max().unwrap_or_default();
         own + largest
     }

@@ -161,8 +161,8 @@ impl Shard {
     }
 
     /// The current distributions of the environment in a slot. `slot` counts from the first slot of the batch.
-    pub(super) fn distributions(&self, slot: usize) -> &[Distribution] {
-        &self.slots[slot - self.first_slot].settings().distributions
+    pub(super) fn distributions(&self, slot: usize) -> Arc<[Distribution]> {
+        Arc::clone(&self.slots[slot - self.first_slot].settings().distributions)
     }
 
     /// The address of the current episode in a slot: seed, environment index and episode index. `slot` counts from the
@@ -295,7 +295,7 @@ impl Shard {
     fn reset(&mut self, reset: &SlotReset) {
         let episodes = &mut self.slots[reset.slot];
         if reset.seed.is_some() || reset.distributions.is_some() {
-            episodes.begin_trial(reset.seed, reset.distributions.as_deref(), reset.state.as_deref());
+            episodes.begin_trial(reset.seed, reset.distributions.clone(), reset.state.as_deref());
         } else {
             episodes.begin(reset.state.as_deref());
         }

@@ -198,6 +198,7 @@ async fn serve(
 /// The optional protocol features that this server supports, in alphabetical order. docs/protocol.md describes them.
 const FEATURES: &[&str] = &[
     "act",
+    "contexts",
     "disturbances",
     "groups",
     "lease",

@@ -269,7 +269,7 @@ fn a_reset_after_use_equals_a_fresh_environment() {
             let mut used = episodes(spec, Version::E, 1, 2, 3);
             play(&mut used, 5, 0, 333);
             let distributions = fresh.settings().distributions.clone();
-            used.begin_trial(Some(77), Some(&distributions), None);
+            used.begin_trial(Some(77), Some(distributions), None);
             assert_eq!(start_line(&used), start_line(&fresh));
             assert_eq!(play(&mut used, 6, 0, 400), play(&mut fresh, 6, 0, 400), "{} {version:?}", spec.name);
         }
@@ -368,7 +368,7 @@ fn new_distributions_or_seeds_begin_a_trial() {
         e.begin(None);
         assert_eq!((e.id().trial_index, e.id().episode_index, e.id().episode_in_trial), (0, 1, 1));
         let fixed: Vec<_> = spec.parameters.iter().map(|p| Distribution::fixed(p.extreme[0].low)).collect();
-        e.begin_trial(None, Some(&fixed), None);
+        e.begin_trial(None, Some(fixed.into()), None);
         assert_eq!((e.id().trial_index, e.id().episode_index, e.id().episode_in_trial), (1, 2, 0));
         let expected: Vec<f64> = spec.parameters.iter().map(|p| p.extreme[0].low).collect();
         assert_eq!(e.receipt().requested, expected);
@@ -446,7 +446,7 @@ fn edits_do_not_accumulate() {
         let mut edited = episodes(spec, Version::E, 1, 0, 1);
         (0..100).for_each(|_| edited.begin(None));
         let defaults = fresh.settings().distributions.clone();
-        edited.begin_trial(Some(1), Some(&defaults), None);
+        edited.begin_trial(Some(1), Some(defaults), None);
         assert_eq!(start_line(&edited), start_line(&fresh));
         assert_eq!(play(&mut edited, 1, 0, 100), play(&mut fresh, 1, 0, 100), "{}", spec.name);
     }

@@ -11,6 +11,7 @@ use perturb::{
 };
 use proptest::prelude::*;
 use rstest::rstest;
+use std::sync::Arc;
 
 /// The table of docs/environments.md and of the paper: environment, parameter, unit, D, R, E.
 #[rustfmt::skip]
@@ -192,7 +193,8 @@ fn overrides_replace_only_what_they_name() {
     resolve(spec, &mut distributions, overrides).unwrap();
     assert_eq!(distributions, [Distribution::fixed(7.0), spec.parameters[1].distribution(Version::R), union]);
 
-    let settings = env::EpisodeSettings { distributions, ..common::settings(spec, Version::R, 5, 0, 1) };
+    let settings =
+        env::EpisodeSettings { distributions: distributions.into(), ..common::settings(spec, Version::R, 5, 0, 1) };
     let mut episodes = env::Episodes::new((spec.make)().unwrap(), settings);
     let mut lengths = Vec::new();
     for _ in 0..50 {
@@ -212,7 +214,7 @@ fn an_override_does_not_move_the_other_parameters_draws() {
     let spec = tasks::catalogue().find("CartPole").unwrap();
     let base = common::settings(spec, Version::E, 9, 2, 1);
     let mut changed = base.clone();
-    resolve(spec, &mut changed.distributions, [("force", Distribution::fixed(7.0))]).unwrap();
+    resolve(spec, Arc::make_mut(&mut changed.distributions), [("force", Distribution::fixed(7.0))]).unwrap();
     let receipt = |settings| env::Episodes::new((spec.make)().unwrap(), settings).receipt().requested;
     assert_eq!(receipt(base)[1..], receipt(changed)[1..]);
 }

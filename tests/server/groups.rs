@@ -1,6 +1,6 @@
 //! Groups of slots with settings of their own, and the release of environments.
 
-use crate::common::server::{Actor, Server, Session, floats, open, parameters, refusal, until};
+use crate::common::server::{Actor, Server, Session, contexts, floats, open, parameters, refusal, until};
 use bytes::Bytes;
 use insta::assert_snapshot;
 use perturb::proto::{AutoresetMode, Open, Release, Reset, SlotGroup, Stepped, Version};
@@ -17,6 +17,7 @@ fn groups() -> Vec<SlotGroup> {
         seed,
         first_environment_index,
         episodes_per_trial,
+        contexts: None,
     };
     vec![
         group(3, Version::Random, 5, 100, 2),
@@ -132,6 +133,7 @@ async fn bad_groups_are_refused() {
         Open { seed: 1, ..both() },
         Open { first_environment_index: 1, ..both() },
         Open { episodes_per_trial: 1, ..both() },
+        Open { contexts: Some(contexts(&["length"], &[0.5])), ..both() },
         spoiled(|groups| groups[1].size = 0),
         spoiled(|groups| groups[0].version = 0),
         spoiled(|groups| groups[0].version = 9),

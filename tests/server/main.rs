@@ -7,6 +7,7 @@ mod acting;
 mod bounds;
 mod catalogue;
 mod conformance;
+mod contexts;
 mod determinism;
 mod distributions;
 mod disturbances;

@@ -319,7 +319,7 @@ fn pendulum(angle: impl Fn(u32) -> f32) -> (Vec<bool>, FinishedEpisode) {
     // The rod is light enough for the torque to hold it at any angle.
     let light = [("length", 1.0), ("mass", 0.1)].map(|(name, value)| (name, perturb::env::Distribution::fixed(value)));
     let mut settings = settings(spec, Version::D, 0, 0, 1);
-    perturb::env::resolve(spec, &mut settings.distributions, light).unwrap();
+    perturb::env::resolve(spec, std::sync::Arc::make_mut(&mut settings.distributions), light).unwrap();
     let mut e = Episodes::new((spec.make)().unwrap(), settings);
     e.begin(Some(&[f64::from(angle(0)), 0.0]));
     let mut near = Vec::new();

@@ -194,6 +194,7 @@ fn is_wrong_server(error: &ClientError) -> bool {
             | ClientError::NoServerProgram { .. }
             | ClientError::NoEnvironment(_)
             | ClientError::NoParameters { .. }
+            | ClientError::NoContexts { .. }
             | ClientError::Disagreement { .. }
             | ClientError::Models { .. }
             | ClientError::Tasks { .. }

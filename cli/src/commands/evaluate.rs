@@ -100,6 +100,7 @@ fn document(state: &State, evaluation_seed: u64, results: &[(String, TestResult)
         "architecture": common.architecture,
         "train_version": common.version,
         "train_parameters": common.parameters,
+        "train_contexts": common.contexts,
         "episodes_per_trial": settings.episodes_per_trial(),
         "seed": common.seed,
         "evaluation_seed": evaluation_seed,

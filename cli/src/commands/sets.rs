@@ -1,6 +1,7 @@
 //! Test sets, parameters and success rules from the command line. Their names may be written in any case.
 
 use std::collections::BTreeMap;
+use std::path::Path;
 
 use perturb_files::read;
 use perturb_learner::proto::Environment;
@@ -27,15 +28,21 @@ pub(super) fn test_sets(versions: &[Version], args: &SetArgs) -> Result<Vec<Test
         sets.push(set_of(PARAMETERS_SET, args.base_version, args.parameters.clone())?);
     }
     if let Some(path) = &args.contexts {
-        let name = path.file_stem().unwrap_or_default().to_string_lossy();
-        if name.parse::<Version>().is_ok() {
-            let message = format!("{}: rename the file, because {name} is the name of a version", path.display());
+        let set = listed_set(args.base_version, path)?;
+        if set.name.parse::<Version>().is_ok() {
+            let message = format!("{}: rename the file, because {} is the name of a version", path.display(), set.name);
             return Err(CommandError::Usage(message));
         }
-        require_file(path, "give a CSV file whose header names parameters, with a row for each context")?;
-        sets.push(set_of_csv(&name, args.base_version, &read(path)?)?);
+        sets.push(set);
     }
     Ok(if sets.is_empty() { Version::ALL.map(TestSet::from).to_vec() } else { sets })
+}
+
+/// Reads the set of --contexts from a CSV file. The file determines the set's name.
+pub(super) fn listed_set(version: Version, path: &Path) -> Result<TestSet> {
+    let name = path.file_stem().unwrap_or_default().to_string_lossy();
+    require_file(path, "give a CSV file whose header names parameters, with a row for each context")?;
+    Ok(set_of_csv(&name, version, &read(path)?)?)
 }
 
 /// Returns the set of `version` in which the values of --parameters replace those of the version. Refuses grids.

@@ -13,6 +13,7 @@ use perturb_learner::logging::Progress;
 use perturb_learner::training::{RunDirectory, train};
 use perturb_protocol::Version;
 use perturb_settings::TrainConfig;
+use perturb_settings::sets::Contexts;
 use toml::{Table, Value};
 
 use super::args::TrainArgs;
@@ -48,9 +49,13 @@ fn begin_run(args: &TrainArgs) -> Result<ExitCode> {
     let servers = playing_servers(&args.play, &stop)?;
     let environment = servers.environment_seen(&config.common)?;
     config.common.environment = environment.name.clone();
-    config.common.parameters =
-        sets::normalize("--parameters", std::mem::take(&mut config.common.parameters), &environment)?;
-    perturb_settings::sets::check("--parameters", &config.common.parameters, &environment)?;
+    let option = if config.common.contexts.is_empty() { "--parameters" } else { "--contexts" };
+    let set = sets::normalize_set(config.common.training_set(option), &environment)?;
+    set.check(&environment)?;
+    match set.contexts {
+        Contexts::Drawn(parameters) => config.common.parameters = parameters,
+        Contexts::Listed(contexts) => config.common.contexts = contexts,
+    }
     let directory = match given_directory {
         Some(directory) => directory,
         None => RunDirectory::choose(&create_default_directory(&config)?, false)?,
@@ -86,12 +91,17 @@ fn flags(args: &TrainArgs) -> Result<Table> {
         let refuse = |value| CommandError::Usage(format!("--{name} {value} is too large: the maximum is {}", i64::MAX));
         value.map(|value| i64::try_from(value).map(Value::Integer).map_err(|_| refuse(value))).transpose()
     };
-    let parameters = sets::drawn_set(args.version.unwrap_or(Version::D), &args.parameters)?.drawn();
+    let version = args.version.unwrap_or(Version::D);
+    let parameters = sets::drawn_set(version, &args.parameters)?.drawn();
     let parameters = Table::try_from(parameters).map_err(|error| CommandError::Usage(error.to_string()))?;
+    let set = args.contexts.as_deref().map(|path| sets::listed_set(version, path)).transpose()?;
+    let contexts = set.map(|set| Value::try_from(set.listed())).transpose();
+    let contexts = contexts.map_err(|error| CommandError::Usage(error.to_string()))?;
     let settings = [
         ("environment", text(&args.env)),
         ("version", text(&args.version.map(|version| version.to_string()))),
         ("parameters", (!parameters.is_empty()).then_some(Value::Table(parameters))),
+        ("contexts", contexts),
         ("preset", text(&args.preset)),
         ("algorithm", text(&args.algorithm)),
         ("architecture", text(&args.architecture)),

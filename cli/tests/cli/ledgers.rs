@@ -64,9 +64,12 @@ impl Kept {
     }
 
     fn train(&self, token: &str, version: &str, out: &str) {
-        let arguments =
-            ["train", "--env", "CartPole", "--version", version, "--algorithm", "ppo", "--architecture", "ff"];
-        let trained = self.run(token, &[&arguments[..], &["--episodes", "60", "--seed", "4", "--out", out]].concat());
+        self.train_with(token, &["--version", version], out);
+    }
+
+    fn train_with(&self, token: &str, options: &[&str], out: &str) {
+        let arguments = ["train", "--env", "CartPole", "--algorithm", "ppo", "--architecture", "ff", "--seed", "4"];
+        let trained = self.run(token, &[&arguments[..], options, &["--episodes", "60", "--out", out]].concat());
         assert!(trained.status.success(), "{}", stderr(&trained));
     }
 
@@ -131,4 +134,26 @@ fn a_ledger_proves_training_apart_from_test_sets() {
     std::fs::write(kept.file("ledger"), ledger.replacen("trainer", "another", 1)).expect("written");
     let (clean, words) = kept.audit("policy", &[]);
     assert!(!clean && words.contains("line 2 of ledger") && words.contains("was changed"), "{words}");
+}
+
+#[test]
+fn ledger_proves_which_contexts_a_training_had() {
+    let kept = Kept::start();
+    std::fs::write(kept.file("own.csv"), "length,mass\n0.3,0.1\n0.5,0.2\n0.7,0.3\n").expect("written");
+    let contexts = ["--version", "R", "--contexts", "own.csv"];
+    kept.train_with("trainer", &contexts, "policy");
+    assert!(kept.evaluate("tester", "policy", "8").status.success());
+    let (clean, words) = kept.audit("policy", &[]);
+    assert!(clean && words.contains("the training was drawn with \"trainer\" in 1 session"), "{words}");
+
+    // The ledger of a training on other contexts does not prove it.
+    let other = Kept::start();
+    std::fs::write(other.file("own.csv"), "length,mass\n0.3,0.1\n0.5,0.2\n").expect("written");
+    other.train_with("trainer", &contexts, "policy");
+    std::fs::copy(other.file("ledger"), kept.file("other")).expect("copied");
+    let arguments = ["audit", "policy.parquet", "--checkpoint", "policy", "--ledger", "other"];
+    let audited = kept.run("tester", &arguments);
+    let words = String::from_utf8_lossy(&audited.stdout);
+    assert!(!audited.status.success() && words.contains("record only 0 of the"), "{words}");
+    assert!(words.contains("trained on R with 3 contexts of length, mass"), "{words}");
 }

@@ -156,6 +156,7 @@ fn snapshots_restore_a_batch_on_any_number_of_servers() {
             environment: environment.into(),
             version: Version::E,
             parameters: Default::default(),
+            contexts: Vec::new(),
             num_envs: n,
             seed: 3,
             episodes_per_trial: 1,

@@ -68,6 +68,7 @@ fn options() -> OpenOptions {
         environment: "CartPole".into(),
         version: Version::D,
         parameters: Default::default(),
+        contexts: Vec::new(),
         num_envs: 2,
         seed: 1,
         episodes_per_trial: 1,

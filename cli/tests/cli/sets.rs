@@ -196,6 +196,41 @@ fn sets_are_tested_rescored_and_replayed() {
 }
 
 #[test]
+fn trainings_on_contexts_end_and_are_replayed() {
+    let directory = experiment();
+    let plan = PLAN.replace("versions = ['D', 'long_poles']", "versions = ['rows', 'corners']");
+    std::fs::write(directory.path().join("plan.toml"), plan).expect("written");
+    stdout(&run(directory.path(), &[]));
+    let out = directory.path().join("out");
+    assert_eq!(stdout(&audit(&out, &["--all"])), "96 of 96 episodes of 2 policies have the same bytes\n");
+    let results = results(directory.path());
+    assert_eq!(
+        results.iter().filter_map(|result| result.training.set.as_deref()).collect::<Vec<_>>(),
+        ["rows", "corners"]
+    );
+    assert!(results[0].command.contains(" --contexts CONTEXTS "), "{}", results[0].command);
+
+    // A training that was interrupted draws the same contexts.
+    let [whole, halves] = ["whole", "halves"].map(|name| directory.path().join(name).display().to_string());
+    let rows = directory.path().join("rows.csv").display().to_string();
+    let train = ["train", "--env", "CartPole", "--contexts", &rows, "--set", "n_steps=16", "--episodes"];
+    stdout(&perturb(&[&train[..], &["60", "--out", &whole]].concat()).output().unwrap());
+    stdout(&perturb(&[&train[..], &["20", "--out", &halves]].concat()).output().unwrap());
+    stdout(&perturb(&["train", "--resume", &halves, "--extend", "40"]).output().unwrap());
+    let drawn = |run: &str| {
+        let log = std::fs::read_to_string(Path::new(run).join("monitor.csv")).expect("a log");
+        let lines = log.lines().skip(2).map(|line| line.split(',').skip(5).collect::<Vec<_>>().join(","));
+        lines.take(60).collect::<Vec<_>>()
+    };
+    let lines = drawn(&whole);
+    assert_eq!(lines, drawn(&halves));
+    for values in [",5,0.3,0.1,", ",15,0.6,0.1,"] {
+        let count = lines.iter().filter(|line| line.contains(values)).count();
+        assert!(count > 15, "{count} of {lines:?}");
+    }
+}
+
+#[test]
 fn disturbed_episodes_are_recorded_and_replayed() {
     let directory = experiment();
     let late = "[sets.late]\naction_delay = '0..2'\nsensor_noise = '0.01..0.1'\npush = 0.5\npush_interval = 5\nchange_at = '0..9'\nchanged_length = '0.8..1'\n\n[sets.grid]\nsensor_delay = '0..2/3'\n";

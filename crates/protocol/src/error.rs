@@ -85,6 +85,12 @@ pub enum ClientError {
          perturb-server of this version, or leave out `observe = \"parameters\"`"
     )]
     NoParameters { address: Address },
+    /// The server does not know [`Open::contexts`](crate::proto::Open::contexts).
+    #[error(
+        "the server at {address} cannot train on a list of contexts: it is older than this program; run a \
+         perturb-server of this version"
+    )]
+    NoContexts { address: Address },
     /// The number of snapshots differs from the number of environments to restore.
     #[error("there are {got} snapshots to restore, expected {expected}: one for each environment")]
     Snapshots { got: usize, expected: usize },
@@ -151,6 +157,7 @@ impl ClientError {
             | Self::Disagreement { .. }
             | Self::Models { .. }
             | Self::NoParameters { .. } // a server of another version
+            | Self::NoContexts { .. }
             | Self::NoServerProgram { .. }
             | Self::Start { .. }
             | Self::System { .. } => true,

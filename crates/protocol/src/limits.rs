@@ -10,9 +10,11 @@ pub const DEFAULT_PORT: u16 = 7447;
 pub const DEFAULT_MAX_ENVS: usize = 16_384;
 /// Default limit of the size of a request, in bytes.
 pub const DEFAULT_MAX_MESSAGE_BYTES: usize = 64 << 20;
-/// Maximal number of intervals in a distribution. The limit saves memory: every environment has its own copy of its
+/// Maximal number of intervals in a distribution. The limit saves memory: every environment may have its own
 /// distributions.
 pub const MAX_INTERVALS: usize = 64;
+/// Maximal number of contexts that the trials of an environment are drawn from.
+pub const MAX_DRAWN_CONTEXTS: usize = 1024;
 /// Accepted width or height of a picture, in pixels.
 pub const PICTURE_PIXELS: RangeInclusive<u16> = 16..=2048;
 /// Default width and height of a picture, in pixels.

@@ -9,8 +9,12 @@ use crate::disturbance::{CHANGED, CHANGES, default_value, is_disturbance};
 use crate::version::Version;
 use crate::{Distribution, DistributionError, proto};
 
+/// Maximal number of boxes of a region in a message. A region has a box for each context.
+const MAX_SHOWN_BOXES: usize = 4;
+
 /// A region of the parameter space: a union of boxes. A box has a set of values for each parameter. The region of
-/// version R+E has two boxes, the box of R and the box of E.
+/// version R+E has two boxes, the box of R and the box of E. The region of a list of contexts has the boxes of its
+/// contexts.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(try_from = "WrittenRegion", into = "WrittenRegion")]
 pub struct Region(Vec<ParameterBox>);
@@ -136,7 +140,7 @@ fn all_parameters(
 
 impl fmt::Display for Region {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        for (i, values) in self.0.iter().enumerate() {
+        for (i, values) in self.0.iter().take(MAX_SHOWN_BOXES).enumerate() {
             for (j, (name, values)) in values.iter().enumerate() {
                 let before = if j > 0 {
                     ", "
@@ -148,7 +152,10 @@ impl fmt::Display for Region {
                 write!(f, "{before}{name} {values}")?;
             }
         }
-        Ok(())
+        match self.0.len().saturating_sub(MAX_SHOWN_BOXES) {
+            0 => Ok(()),
+            others => write!(f, ", or {others} others"),
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! Parameter sets: the parameter values that a policy is tested on. A set is one of an environment's versions D
+//! Parameter sets: the parameter values that a policy is trained or tested on. A set is one of an environment's versions D
 //! (deterministic), R (random), E (extreme) and R+E, possibly with other values for some parameters.
 
 mod rows;
@@ -8,6 +8,7 @@ use std::str::FromStr;
 
 use perturb_protocol::limits::DEFAULT_MAX_ENVS;
 use perturb_protocol::proto::Interval;
+use perturb_protocol::region::Region;
 use perturb_protocol::{Distribution, DistributionError, Version, decimal_comma, proto};
 use serde::{Deserialize, Serialize};
 
@@ -20,10 +21,10 @@ pub type Parameters = BTreeMap<String, Distribution>;
 /// version.
 pub type Context = BTreeMap<String, f64>;
 
-/// Maximal number of contexts in a set. It is limited because the environments of all contexts run together.
+/// Maximal number of contexts in a set for tests. It is limited because the environments of all contexts run together.
 pub const MAX_CONTEXTS: usize = DEFAULT_MAX_ENVS;
 
-/// A parameter set that a policy is tested on.
+/// A parameter set that a policy is trained or tested on.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub struct TestSet {
     /// The name of the set in results.
@@ -40,8 +41,8 @@ pub struct TestSet {
 pub enum Contexts {
     /// Values are drawn from these distributions for each episode (with RL², for each trial).
     Drawn(Parameters),
-    /// Each of these contexts is used for the same number of episodes. Contexts are the points of a grid or the rows of
-    /// a file.
+    /// Tests use each of these contexts for the same number of episodes. Trainings draw a context for each trial, all
+    /// with equal probability. Contexts are the points of a grid or the rows of a file.
     Listed(Vec<Context>),
 }
 
@@ -91,6 +92,12 @@ impl TestSet {
             Contexts::Drawn(_) => vec![Context::new()],
             Contexts::Listed(contexts) => contexts.clone(),
         }
+    }
+
+    /// Returns the region of parameter values that the set has in `environment`.
+    pub fn region(&self, environment: &proto::Environment) -> Region {
+        let of = |context| Region::from_version(environment, self.version, &self.parameters(context));
+        Region::new(self.listed().iter().flat_map(|context| of(context).boxes().to_vec()).collect())
     }
 
     /// Checks that `environment` has the set's parameters and accepts all their values.

@@ -9,7 +9,7 @@ use perturb_files::interrupt::StopFlag;
 use perturb_protocol::Distribution;
 use perturb_records::paper::ENVIRONMENTS;
 use perturb_records::{RecordedTest, Records, TestResult};
-use perturb_settings::sets::{Parameters, TestSet};
+use perturb_settings::sets::{Contexts, Parameters, TestSet};
 
 use super::CellError;
 use crate::checkpoint::Checkpoint;
@@ -118,8 +118,8 @@ fn parameters(parameters: &Parameters) -> String {
     texts.collect::<Vec<_>>().join(" ")
 }
 
-/// Returns the shell command that reproduces a cell's result without the plan. RUN stands for the output folder, and
-/// TASK for the folder of a task that is not built in.
+/// Returns the shell command that reproduces a cell's result without the plan. RUN stands for the output folder, TASK
+/// for the folder of a task that is not built in, and CONTEXTS for the CSV file of the contexts that it is trained on.
 fn command(cell: &Cell) -> String {
     let common = &cell.config.common;
     // The command of the training: the main settings have flags, all others are passed with `--set`.
@@ -137,7 +137,10 @@ fn command(cell: &Cell) -> String {
     if !common.parameters.is_empty() {
         let _ = write!(text, " --parameters {}", parameters(&common.parameters));
     }
-    let flags = ["environment", "version", "parameters", "algorithm", "architecture", "episodes", "seed"];
+    if !common.contexts.is_empty() {
+        text += " --contexts CONTEXTS";
+    }
+    let flags = ["environment", "version", "parameters", "contexts", "algorithm", "architecture", "episodes", "seed"];
     for (key, value) in cell.config.table().iter().filter(|(key, _)| !flags.contains(&key.as_str())) {
         let value = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
         let _ = write!(text, " --set {key}={value}"); // writing to a String cannot fail
@@ -158,7 +161,11 @@ fn command(cell: &Cell) -> String {
         evaluate(own(set), *episodes);
     }
     if let Some((set, episodes)) = cell.selection_test() {
-        let how = set.plain().map_or_else(|| own(&set), |version| format!("--versions {version}"));
+        let how = match (set.plain(), &set.contexts) {
+            (Some(version), _) => format!("--versions {version}"),
+            (None, Contexts::Drawn(_)) => own(&set),
+            (None, Contexts::Listed(_)) => format!("--contexts CONTEXTS --base-version {}", set.version),
+        };
         evaluate(format!("{how} --selection-episodes"), episodes);
     }
     text

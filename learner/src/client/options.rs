@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use perturb_protocol::{Version, proto};
 use perturb_settings::Observe;
-use perturb_settings::sets::Parameters;
+use perturb_settings::sets::{Context, Parameters};
 
 use crate::proto::AutoresetMode;
 
@@ -18,6 +18,8 @@ pub struct OpenOptions {
     pub version: Version,
     /// Distributions that replace the version's, by parameter name.
     pub parameters: Parameters,
+    /// Contexts, one of which each trial has; all have the same parameters. If empty, trials have no contexts.
+    pub contexts: Vec<Context>,
     /// N, the number of environments, at least 1.
     pub num_envs: usize,
     /// The seed of the environments. With the environment's index it determines all their random numbers.
@@ -87,10 +89,16 @@ pub(super) fn open_request(
     };
     Some(match <[proto::SlotGroup; 1]>::try_from(groups) {
         Err(groups) => proto::Open { groups, ..open },
-        Ok([proto::SlotGroup { size, version, parameters, seed, first_environment_index, episodes_per_trial }]) => {
-            let batch_size = size;
-            proto::Open { version, parameters, batch_size, seed, first_environment_index, episodes_per_trial, ..open }
-        }
+        Ok([group]) => proto::Open {
+            version: group.version,
+            parameters: group.parameters,
+            batch_size: group.size,
+            seed: group.seed,
+            first_environment_index: group.first_environment_index,
+            episodes_per_trial: group.episodes_per_trial,
+            contexts: group.contexts,
+            ..open
+        },
     })
 }
 
@@ -105,6 +113,10 @@ impl OpenOptions {
             seed: self.seed,
             first_environment_index: u32::try_from(first).ok()?,
             episodes_per_trial: self.episodes_per_trial,
+            contexts: self.contexts.first().map(|first| proto::Contexts {
+                names: first.keys().cloned().collect(),
+                values: self.contexts.iter().flat_map(|context| context.values().copied()).collect(),
+            }),
         })
     }
 }
@@ -119,6 +131,7 @@ mod tests {
             environment,
             version: Version::D,
             parameters: Default::default(),
+            contexts: Vec::new(),
             num_envs,
             seed,
             episodes_per_trial: 1,

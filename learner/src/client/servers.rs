@@ -359,8 +359,7 @@ impl Servers {
         names: impl Iterator<Item = &'a str>,
     ) -> Result<proto::Environment, ClientError> {
         let environment = self.environment(&common.environment)?;
-        let trained = common.parameters.keys().map(String::as_str);
-        let environment = environment.with_parameters(trained.chain(names));
+        let environment = environment.with_parameters(common.parameter_names().chain(names));
         let sees = common.observe.sees_parameters();
         match self.connections().first() {
             Some(first) if sees && environment.parameter_observations.is_empty() => {

@@ -42,8 +42,12 @@ impl ServerShard {
             message: format!("environments {range:?} are more than the protocol can number (2^32 - 1)"),
         })?;
         let asked = open.observe_parameters;
+        let has_contexts = open.contexts.is_some() || open.groups.iter().any(|group| group.contexts.is_some());
         let (stream, opened) = Stream::open(connection, open).await?;
         check_observed(connection.address(), asked, &opened)?;
+        if has_contexts && !opened.supports_contexts {
+            return Err(ClientError::NoContexts { address: connection.address().clone() });
+        }
         let snapshot_bytes = opened.max_snapshot_reply_bytes as usize / range.len().max(1);
         Ok((Self { stream, range, snapshot_bytes, actions: BytesMut::new(), asked: false }, opened))
     }

@@ -145,6 +145,7 @@ impl<'a> Replay<'a> {
             environment: about.environment.clone(),
             version: Version::D,
             parameters: with_disturbances(Parameters::new(), &environment),
+            contexts: Vec::new(),
             num_envs,
             seed: 0,
             episodes_per_trial: about.episodes_per_trial,

@@ -26,6 +26,7 @@ pub(super) fn options(config: &TrainConfig) -> OpenOptions {
         environment: common.environment.clone(),
         version: common.version,
         parameters: common.parameters.clone(),
+        contexts: common.contexts.clone(),
         num_envs: common.num_envs,
         seed: common.seed,
         episodes_per_trial: config.settings.episodes_per_trial(),

@@ -27,6 +27,7 @@ pub fn options(environment: &str, num_envs: usize, episodes_per_trial: u32) -> O
         environment: environment.into(),
         version: Version::R,
         parameters: Default::default(),
+        contexts: Vec::new(),
         num_envs,
         seed: 3,
         episodes_per_trial,

@@ -92,7 +92,7 @@ impl DrawAuditor {
         if self.is_exempt() {
             return Ok(PendingDraws::default());
         }
-        let (mut previous, mut starts) = (Vec::new(), Vec::new());
+        let (mut previous, mut starts): (_, Vec<(Draw, Arc<[Distribution]>)>) = (Vec::new(), Vec::new());
         for ResetEntry { slot, seed, distributions, .. } in entries {
             if seed.is_none() && distributions.is_none() {
                 continue; // the reset continues the current sequence of draws
@@ -104,7 +104,7 @@ impl DrawAuditor {
             };
             previous.push(before);
             let same = || batch.distributions(*slot);
-            starts.push((next, distributions.as_ref().map_or_else(same, |new| new.to_vec())));
+            starts.push((next, distributions.as_ref().map_or_else(same, Arc::clone)));
         }
         if previous.is_empty() {
             return Ok(PendingDraws::default());
@@ -121,7 +121,7 @@ impl DrawAuditor {
         let spec = batch.settings().spec;
         let saved: Result<Vec<_>, env::Error> =
             entries.iter().map(|(_, snapshot)| saved_draw(spec, snapshot)).collect();
-        let mut starts = Vec::new();
+        let mut starts: Vec<(Draw, Arc<[Distribution]>)> = Vec::new();
         for saved in saved? {
             let boxes = saved.distributions.chunks(spec.parameters.len().max(1));
             let are_drawn =
@@ -131,7 +131,7 @@ impl DrawAuditor {
                 // snapshot. The parameters stay in force until the trial ends, so they are checked like a draw.
                 starts.push((saved.draw, saved.values.iter().copied().map(Distribution::fixed).collect()));
             }
-            starts.push((saved.draw, saved.distributions));
+            starts.push((saved.draw, saved.distributions.into()));
         }
         let previous = entries.iter().map(|(slot, _)| batch.draw(*slot)).collect();
         let begins = starts.iter().map(|(draw, distributions)| (NextDraw { draw: *draw, distributions }, 1));

@@ -213,7 +213,7 @@ struct Trial {
 /// Steps an environment with random actions for the time [`TIMED`].
 fn try_steps(task: &'static FolderTask) -> Result<Trial, crate::env::Error> {
     let spec = &task.spec;
-    let distributions = spec.distributions(Version::D);
+    let distributions = spec.distributions(Version::D).into();
     let settings = EpisodeSettings { seed: 0, environment_index: 0, distributions, episodes_per_trial: 1 };
     let mut episodes = Episodes::new((spec.make)()?, settings);
     let mut trial = Trial { steps_per_second: 0.0, episodes: 0, diverged: 0 };

@@ -62,7 +62,7 @@ pub fn settings(spec: &EnvironmentSpec, version: Version, seed: u64, index: u32,
     EpisodeSettings {
         seed,
         environment_index: index,
-        distributions: spec.distributions(version),
+        distributions: spec.distributions(version).into(),
         episodes_per_trial: per_trial,
     }
 }

@@ -436,3 +436,8 @@ pub fn union(intervals: &[(f64, f64)]) -> proto::Distribution {
 pub fn parameters(each: &[(&str, &[(f64, f64)])]) -> std::collections::HashMap<String, proto::Distribution> {
     each.iter().map(|(name, intervals)| ((*name).into(), union(intervals))).collect()
 }
+
+/// Returns contexts: the values of these parameters, row by row.
+pub fn contexts(names: &[&str], values: &[f64]) -> proto::Contexts {
+    proto::Contexts { names: names.iter().map(|&name| name.into()).collect(), values: values.into() }
+}

@@ -239,7 +239,7 @@ fn names_that_are_neither_are_refused_with_those_that_are() {
          changed_length, changed_mass"
     );
     assert!(std::ptr::eq(disturbance::with_parameters(spec, ["length", "mass"]).unwrap(), spec));
-    let mut base = settings(spec, Version::D, &[], (0, 0)).distributions;
+    let mut base = settings(spec, Version::D, &[], (0, 0)).distributions.to_vec();
     assert!(resolve(spec, &mut base, [("action_delay", Distribution::fixed(1.0))]).is_err());
     let open = disturbance::check_open(spec, ["action_delay"]).unwrap_err();
     assert!(matches!(open, Error::NotDisturbed { .. }), "{open}");

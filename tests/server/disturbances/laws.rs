@@ -3,6 +3,7 @@
 use super::{disturbed, echo};
 use crate::common::observe;
 use perturb::env::{Action, Draw, DrawPurpose, Episodes, PhiloxStream, Version};
+use std::sync::Arc;
 
 /// The number of draws for the test of a distribution.
 const DRAWS: u32 = 100_000;
@@ -261,7 +262,7 @@ fn observations_pass_delay_noise_and_dropout_in_order() {
 #[test]
 fn whole_numbers_are_drawn_as_likely() {
     let mut settings = super::settings(&echo::SPEC, Version::D, &[], ADDRESS);
-    settings.distributions[0] = "0..4".parse().unwrap();
+    Arc::make_mut(&mut settings.distributions)[0] = "0..4".parse().unwrap();
     let spec = perturb::env::disturbance::disturbed(&echo::SPEC);
     let mut episodes = Episodes::new((spec.make)().unwrap(), settings);
     const EPISODES: usize = 20_000;

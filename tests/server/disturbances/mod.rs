@@ -22,7 +22,7 @@ fn settings(
     let spec = disturbance::disturbed(spec);
     let mut distributions = spec.distributions(version);
     resolve(spec, &mut distributions, values.iter().map(|&(name, value)| (name, Distribution::fixed(value)))).unwrap();
-    EpisodeSettings { seed, environment_index, distributions, episodes_per_trial: 1 }
+    EpisodeSettings { seed, environment_index, distributions: distributions.into(), episodes_per_trial: 1 }
 }
 
 /// Returns a disturbed environment, with a version and these values of parameters, at the start of its first episode.

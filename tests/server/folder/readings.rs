@@ -178,7 +178,7 @@ fn huge_actions_make_finite_rewards() {
 /// success.
 fn achieved(name: &str, success: &str) -> (Option<f64>, bool) {
     let spec = with(name, &[("success", success), ("step_limit", "step_limit = 5")]);
-    let distributions = spec.distributions(Version::D);
+    let distributions = spec.distributions(Version::D).into();
     let settings = EpisodeSettings { seed: 1, environment_index: 0, distributions, episodes_per_trial: 1 };
     let mut episodes = Episodes::new((spec.make)().unwrap(), settings);
     episodes.begin(Some(&[0.0, 0.0, 1.0, 0.0]));

@@ -5,7 +5,7 @@ use super::{
     tokens::{ANN, BOB, Guarded, entry},
 };
 use crate::{
-    common::server::{Server, channel, command, open, until, within},
+    common::server::{Server, channel, command, contexts, open, until, within},
     dm_env_rpc::client::{Agent, Settings, choice, create, double, reset_world, settings, text, uint64},
     metrics::Page,
 };
@@ -50,6 +50,27 @@ async fn equal_draws_of_successive_environments_are_one_entry() {
     let line = draws(&guarded.directory.path().join("ledger")).pop().unwrap();
     assert_eq!(line.begins, [DrawStart { seed: 11, index: 5, count: 4, region: 0, episode: 0 }]);
     assert_eq!(line.ends, [DrawEnd { seed: 7, index: 5, count: 4, episode: Some(0) }]);
+}
+
+#[tokio::test]
+async fn ledger_has_every_context() {
+    let guarded = Guarded::start(&entry("ann", ANN, ""));
+    let lengths: Vec<f64> = (0..6).map(|row| 0.3 + f64::from(row) / 64.0).collect();
+    let request = Open { contexts: Some(contexts(&["length"], &lengths)), ..open("CartPole", 4, 7) };
+    let (mut session, _) = within(Stream::open(&guarded.connect(ANN).await, request)).await.unwrap();
+    let path = guarded.directory.path().join("ledger");
+    let line = draws(&path).pop().unwrap();
+    assert_eq!((line.regions.len(), line.begins[0].count), (1, 4));
+    let drawn: Vec<f64> =
+        line.regions[0].boxes().iter().map(|values| values["length"].fixed_value().unwrap()).collect();
+    assert_eq!(drawn, lengths);
+    let region = line.regions[0].to_string();
+    assert!(region.ends_with("or force [5, 15], length 0.346875, mass [0.05, 0.5], or 2 others"), "{region}");
+
+    // A restored environment draws from the contexts in its snapshot.
+    let snapshots = within(session.ask(Snapshot::default())).await.unwrap().snapshots;
+    within(session.ask(Restore { snapshots, ..Restore::default() })).await.unwrap();
+    assert_eq!(draws(&path).pop().unwrap().regions, line.regions);
 }
 
 #[tokio::test]

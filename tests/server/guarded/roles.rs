@@ -4,7 +4,7 @@ use super::{
     connect,
     tokens::{ANN, BOB, Guarded, entry},
 };
-use crate::common::server::{open, within};
+use crate::common::server::{contexts, open, within};
 use perturb::proto::{Distribution, Interval, Open, Reset, Restore, SlotGroup, Snapshot, Version};
 use perturb_protocol::{ClientError, Stream};
 use rstest::rstest;
@@ -32,6 +32,10 @@ fn of(version: Version, parameters: &[(&str, f64, f64)]) -> Open {
     Open { version: version.into(), parameters: values(parameters), ..open("CartPole", 2, 1) }
 }
 
+fn listed(lengths: &[f64]) -> Open {
+    Open { contexts: Some(contexts(&["length"], lengths)), ..of(Version::Random, &[]) }
+}
+
 fn values(parameters: &[(&str, f64, f64)]) -> HashMap<String, Distribution> {
     let interval = |low, high| Distribution { intervals: vec![Interval { low, high }] };
     parameters.iter().map(|&(name, low, high)| (name.to_owned(), interval(low, high))).collect()
@@ -55,6 +59,9 @@ fn denied<T>(result: Result<T, ClientError>) -> String {
 #[case::one_of_e(of(Version::Default, &[("length", 1.1, 1.2)]), Some("length [1.1, 1.2]"))]
 #[case::held_out(of(Version::Random, &[("length", 0.65, 0.8)]), Some("never draw from \"holdout\""))]
 #[case::held_out_point(of(Version::Random, &[("length", 0.65, 0.65)]), Some("never draw from \"holdout\""))]
+#[case::contexts(listed(&[0.3, 0.5]), None)]
+#[case::context_of_e(listed(&[0.3, 0.9]), Some("only from D and R"))]
+#[case::held_out_context(listed(&[0.3, 0.65]), Some("never draw from \"holdout\""))]
 #[case::all_of_it(of(Version::Random, &[]), Some("never draw from \"holdout\""))]
 #[tokio::test]
 async fn a_role_says_what_its_tokens_draw_from(#[case] open: Open, #[case] refusal: Option<&str>) {

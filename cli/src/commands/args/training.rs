@@ -44,6 +44,10 @@ pub struct TrainArgs {
     /// length=0.3..0.4,0.8..0.9 mass=0.1.
     #[arg(long, value_name = "PARAMETER=VALUES", num_args = 1..)]
     pub parameters: Vec<Assignment>,
+    /// A list of parameters to train on: a CSV file whose header names parameters, with a row for each of 1 to 1024
+    /// contexts. Each trial has the values of one row; all rows are equally likely.
+    #[arg(long, value_name = "FILE", conflicts_with = "parameters")]
+    pub contexts: Option<PathBuf>,
     /// Defaults of the settings: perturb's recommended ones, or those of the paper's authors [default: perturb].
     #[arg(long, value_parser = OneOf::new(&Preset::NAMES))]
     pub preset: Option<String>,
@@ -87,7 +91,7 @@ pub struct TrainArgs {
         long,
         value_name = "DIR",
         conflicts_with_all = [
-            "env", "version", "parameters", "preset", "algorithm", "architecture", "observe", "episodes_per_trial",
+            "env", "version", "parameters", "contexts", "preset", "algorithm", "architecture", "observe", "episodes_per_trial",
             "episodes", "seed", "out", "overwrite", "config", "set"
         ]
     )]

@@ -68,6 +68,7 @@ pub(super) fn print_result(
         "architecture": common.architecture,
         "train_version": common.version,
         "train_parameters": common.parameters,
+        "train_contexts": common.contexts,
         "seed": common.seed,
         "training_episodes": state.counters.episodes,
         "training_steps": state.counters.timesteps,

@@ -12,9 +12,12 @@ use super::{AnyError, Cell, SELECTION_TEST, Tests};
 
 type Result<T, E = AnyError> = std::result::Result<T, E>;
 
-/// Expands `file` to two lists: its cells, and the candidates that its selection may add. `sets` are the versions and
-/// the parameter sets of the file by name. Cells are ordered by environment, then as in the tables `[[algorithm]]`.
-pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(Vec<Cell>, Vec<Cell>)> {
+/// The versions and the parameter sets of an experiment file, by environment and name.
+type Sets<'a> = BTreeMap<&'a str, BTreeMap<String, TestSet>>;
+
+/// Expands `file` to two lists: its cells, and the candidates that its selection may add. `sets` has the sets of each of
+/// the file's environments. Cells are ordered by environment, then as in the tables `[[algorithm]]`.
+pub(super) fn expand(file: &File, sets: &Sets<'_>) -> Result<(Vec<Cell>, Vec<Cell>)> {
     let mut expansion = Expansion { file, sets, cells: Vec::new(), tables: HashMap::new() };
     for (index, block) in file.algorithm.iter().enumerate() {
         expansion.add_block(&format!("[[algorithm]] {} ({})", index + 1, block.name), block)?;
@@ -31,17 +34,18 @@ pub(super) fn expand(file: &File, sets: &BTreeMap<String, TestSet>) -> Result<(V
 /// The state of the expansion of an experiment file.
 struct Expansion<'a> {
     file: &'a File,
-    sets: &'a BTreeMap<String, TestSet>,
+    sets: &'a Sets<'a>,
     cells: Vec<Cell>,
     /// The name of the table `[[algorithm]]` that each cell is from, by cell id.
     tables: HashMap<String, String>,
 }
 
 impl Expansion<'_> {
-    /// Returns the version or parameter set with this name.
-    fn set(&self, name: &str) -> Result<&TestSet, ValueError> {
-        self.sets.get(name).ok_or_else(|| {
-            let known: Vec<&str> = self.sets.keys().map(String::as_str).collect();
+    /// Returns the version or parameter set of an environment with this name.
+    fn set(&self, environment: &str, name: &str) -> Result<&TestSet, ValueError> {
+        let sets = &self.sets[environment];
+        sets.get(name).ok_or_else(|| {
+            let known: Vec<&str> = sets.keys().map(String::as_str).collect();
             let expected = format!("one of {}, or a set [sets.{name}]", known.join(", "));
             ValueError::new("a version", format!("`{name}`"), expected)
         })
@@ -74,10 +78,7 @@ impl Expansion<'_> {
         [environment, architecture, trained_on]: [&str; 3],
         point: &Table,
     ) -> Result<TrainConfig> {
-        let set = self.set(trained_on)?;
-        let expected = "a version or a set whose parameters are drawn: a training draws them";
-        let is_drawn = matches!(set.contexts, Contexts::Drawn(_));
-        require(is_drawn, format!("{name}: versions"), format!("`{trained_on}`"), expected)?;
+        let set = self.set(environment, trained_on)?;
         let mut table = self.file.settings.clone();
         table.extend(block.settings.clone());
         table.extend(point.clone());
@@ -90,9 +91,11 @@ impl Expansion<'_> {
         ] {
             table.insert(key.to_owned(), value.into());
         }
-        if set.plain().is_none() {
-            table.insert("parameters".into(), Value::Table(Table::try_from(set.drawn())?));
-        }
+        match &set.contexts {
+            Contexts::Drawn(parameters) if parameters.is_empty() => None,
+            Contexts::Drawn(parameters) => table.insert("parameters".into(), Value::try_from(parameters)?),
+            Contexts::Listed(contexts) => table.insert("contexts".into(), Value::try_from(contexts)?),
+        };
         TrainConfig::from_table("the cell", table).map_err(|error| {
             let place = place_of(&error, name, block, &self.file.settings);
             format!("{place}: {error}").into()
@@ -102,10 +105,11 @@ impl Expansion<'_> {
     /// Adds the cells of all runs of one configuration. With `selection = "clean"`, adds its tuning runs first.
     fn add_runs(&mut self, name: &str, config: TrainConfig, trained_on: &str) -> Result<()> {
         let file = self.file;
-        let sets = file.test_versions.iter().map(|name| self.set(name).cloned());
+        let environment = &config.common.environment;
+        let sets = file.test_versions.iter().map(|name| self.set(environment, name).cloned());
         let mut sets = sets.collect::<Result<Vec<_>, _>>()?;
         sets.sort_by_key(|set| set.plain().map_or(Version::KNOWN.len(), |version| version as usize));
-        let success = file.success_in(&config.common.environment, config.common.preset);
+        let success = file.success_in(environment, config.common.preset);
         let budget = config.common.episodes;
         let last = file.evaluate_at.last().copied().unwrap_or_default();
         let expected = format!("at most the {budget} episodes of a training");
@@ -133,7 +137,7 @@ impl Expansion<'_> {
         tuned_as: Option<String>,
     ) -> Result<()> {
         let configuration = fingerprint(config, tests);
-        let plain = self.set(trained_on)?.plain();
+        let plain = self.set(&config.common.environment, trained_on)?.plain();
         let set = plain.is_none().then(|| trained_on.to_owned());
         let trained_on = plain.map_or(trained_on, |version| version.file_name());
         for run in 1..=runs {
@@ -199,7 +203,7 @@ fn fingerprint(config: &TrainConfig, tests: &Tests) -> String {
     table.remove("seed");
     // A cell's id names the version or the parameter set. The name of a set does not determine its parameters and its
     // version, so both stay in the hash.
-    if config.common.parameters.is_empty() {
+    if config.common.parameter_names().next().is_none() {
         table.remove("version");
     }
     // The hash does not depend on the order of keys in the file, because `toml::Table` is a sorted map.

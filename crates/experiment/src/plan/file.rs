@@ -17,7 +17,8 @@ use super::{Selection, distinct};
 
 /// Settings that `[settings]`, `[algorithm.settings]` and `[algorithm.grid]` must not contain, because other keys of
 /// the plan determine them.
-const OWN_KEYS: [&str; 7] = ["preset", "environment", "version", "parameters", "algorithm", "architecture", "seed"];
+const OWN_KEYS: [&str; 8] =
+    ["preset", "environment", "version", "parameters", "contexts", "algorithm", "architecture", "seed"];
 /// Maximum number of cells of a plan.
 const MAX_CELLS: usize = 1_000_000;
 

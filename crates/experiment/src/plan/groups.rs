@@ -8,9 +8,14 @@
 use std::ops::Range;
 
 use perturb_protocol::disturbance::is_disturbance;
+use perturb_settings::sets::Context;
 use perturb_settings::{Architecture, CollectionMode, Observe, TrainConfig};
 
 use super::{Cell, Plan, distinct};
+
+/// Maximal number of values in the contexts of a group. Together they take half of the mebibyte that a request to open
+/// environments may have.
+const MAX_CONTEXT_VALUES: usize = (1 << 19) / size_of::<f64>();
 
 /// Limits on the size and number of groups.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -41,8 +46,13 @@ impl Cell {
     /// has disturbances. Only cells of the same kind can be in one group.
     pub fn kind(&self) -> (&str, Architecture, Observe, CollectionMode, bool) {
         let TrainConfig { common, .. } = &self.config;
-        let is_disturbed = common.parameters.keys().any(|name| is_disturbance(name));
+        let is_disturbed = common.parameter_names().any(is_disturbance);
         (&common.environment, common.architecture, common.observe, self.config.rollouts(), is_disturbed)
+    }
+
+    /// Returns the number of values in all contexts of the training.
+    fn context_values(&self) -> usize {
+        self.config.common.contexts.iter().map(Context::len).sum()
     }
 }
 
@@ -53,6 +63,9 @@ impl Plan {
         let mut groups: Vec<Vec<usize>> = Vec::new();
         for kind in distinct(cells.iter().map(|&cell| self.cells[cell].kind())) {
             let of_kind: Vec<usize> = cells.iter().copied().filter(|&cell| self.cells[cell].kind() == kind).collect();
+            let values = of_kind.iter().map(|&cell| self.cells[cell].context_values()).max().unwrap_or_default();
+            let max_cells = grouping.max_cells.min(MAX_CONTEXT_VALUES / values.max(1));
+            let grouping = Grouping { max_cells, ..grouping };
             groups.extend(grouping.cut(of_kind.len()).map(|range| of_kind[range].to_vec()));
         }
         groups
@@ -83,6 +96,18 @@ mod tests {
         let ranges: Vec<Range<usize>> = Grouping { max_cells: most, at_a_time }.cut(cells).collect();
         assert_eq!(ranges.iter().map(Range::len).collect::<Vec<_>>(), sizes);
         assert!(ranges.into_iter().flatten().eq(0..cells));
+    }
+
+    #[test]
+    fn group_has_no_more_contexts_than_a_request() {
+        let text = "environments = ['CartPole']\nversions = ['many']\nruns = 50\n[sets.many]\nfile = 'many.csv'
+            [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+        for (rows, size) in [(16, 50), (1024, 32)] {
+            let csv_file = |_: &str| Ok(format!("force,length\n{}", "7,0.5\n".repeat(rows)).into_bytes());
+            let plan = Plan::parse_with("plan.toml", text.into(), std::path::Path::new(""), &csv_file).unwrap();
+            let groups = plan.groups(&(0..50).collect::<Vec<_>>(), Grouping::BY_KIND);
+            assert!(groups.iter().all(|group| group.len() <= size) && groups.len() == 50_usize.div_ceil(size));
+        }
     }
 
     #[test]

@@ -25,7 +25,7 @@ use perturb_files::{self as files, AnyError, FileError};
 pub use perturb_records::SELECTION_TEST;
 use perturb_records::TrainedOn;
 use perturb_records::success::{Criterion, Rule};
-use perturb_settings::sets::{Contexts, TestSet, check as check_parameters};
+use perturb_settings::sets::TestSet;
 use perturb_settings::{Method, TrainConfig, ValueError, require};
 use sets::ReadCsvFile;
 
@@ -198,7 +198,7 @@ impl Plan {
         let text = files::read_toml(path)?;
         let file: File = toml::from_str(&text).map_err(|error| refused(words(&error).into()))?;
         let folder = path.parent().unwrap_or(Path::new(""));
-        let sets = sets::read(&file.sets, &|name| sets::content(name, folder), &mut BTreeMap::new())
+        let sets = sets::read(&file.sets, None, &|name| sets::content(name, folder), &mut BTreeMap::new())
             .map_err(|error| refused(error.into()))?;
         Ok(sets.into_values().filter(|set| set.plain().is_none()).collect())
     }
@@ -240,7 +240,10 @@ impl Plan {
         file.check()?;
         let mut csv_files = BTreeMap::new();
         let (text, tasks) = tasks::resolve(text, &file.tasks, folder)?;
-        let sets = sets::read(&file.sets, read_csv_file, &mut csv_files)?;
+        let mut sets = BTreeMap::new();
+        for environment in file.all_environments() {
+            sets.insert(environment, sets::read(&file.sets, Some(environment), read_csv_file, &mut csv_files)?);
+        }
         let (cells, candidates) = expansion::expand(&file, &sets)?;
         let (selection, runs, tuning_runs) = (file.selection, file.runs, file.tuning_runs());
         let title = file.title.unwrap_or_default();
@@ -267,7 +270,7 @@ impl Plan {
         let (text, code) = (Criterion::from_environment(environment), Criterion::from_environment_code(environment));
         for cell in self.cells.iter().filter(|cell| cell.config.common.environment == environment.name) {
             let trained = cell.set.as_deref().unwrap_or_default();
-            check_parameters(trained, &cell.config.common.parameters, environment)?;
+            cell.config.common.training_set(trained).check(environment)?;
             cell.tests.sets.iter().try_for_each(|set| set.check(environment))?;
             if let Some(rule) = &cell.tests.success {
                 rule.criterion(text.as_ref(), code.as_ref())?;
@@ -350,8 +353,7 @@ impl Cell {
     /// Returns the set and the number of episodes of the separate selection test. Returns `None` if configurations are
     /// selected by the reported tests.
     pub fn selection_test(&self) -> Option<(TestSet, u64)> {
-        let parameters = Contexts::Drawn(self.config.common.parameters.clone());
-        let set = TestSet { name: SELECTION_TEST.into(), version: self.config.common.version, contexts: parameters };
+        let set = self.config.common.training_set(SELECTION_TEST);
         self.tests.selection.map(|episodes| (set, episodes))
     }
 

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use perturb_files::read_if_exists;
 use perturb_protocol::Version;
-use perturb_settings::sets::{Assignment, TestSet, set_of, set_of_csv};
+use perturb_settings::sets::{Assignment, Contexts, TestSet, set_of, set_of_csv};
 use perturb_settings::{ValueError, require};
 use toml::{Table, Value};
 
@@ -15,14 +15,19 @@ use super::file::is_plain;
 const VERSION: &str = "version";
 /// Key of a set's table: the name of a CSV file of contexts.
 const FILE: &str = "file";
+/// Key of a set's table: how many contexts of the file the set has, counted from the first.
+const ROWS: &str = "rows";
+/// The part of a CSV file's name that stands for the name of the environment.
+const ENVIRONMENT: &str = "{environment}";
 
 /// A function that reads a file by name. Its error is a phrase that describes what was found instead of the file.
 pub(super) type ReadCsvFile<'a> = dyn Fn(&str) -> Result<Vec<u8>, String> + 'a;
 
-/// Returns all versions and the parameter sets in `tables`, by name. Inserts the CSV files that the sets name into
-/// `csv_files`.
+/// Returns all versions and the parameter sets in `tables`, by name, as `environment` has them. Without an environment,
+/// the names of files cannot depend on it. Inserts the CSV files that the sets name into `csv_files`.
 pub(super) fn read(
     tables: &BTreeMap<String, Table>,
+    environment: Option<&str>,
     read_csv_file: &ReadCsvFile<'_>,
     csv_files: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<BTreeMap<String, TestSet>, ValueError> {
@@ -34,7 +39,7 @@ pub(super) fn read(
         require(name.parse::<Version>().is_err(), &key, "there already", "another name than D, R, E and R+E")?;
         let expected = "values of some parameters, or left out: it is a version";
         require(table.keys().any(|key| key != VERSION), &key, "without parameters", expected)?;
-        let set = read_set(name, table, read_csv_file, csv_files)
+        let set = read_set(name, table, environment, read_csv_file, csv_files)
             .map_err(|error| ValueError { what: format!("{key}: {}", error.what), ..error })?;
         sets.insert(name.clone(), set);
     }
@@ -45,11 +50,13 @@ pub(super) fn read(
 fn read_set(
     name: &str,
     table: &Table,
+    environment: Option<&str>,
     read_csv_file: &ReadCsvFile<'_>,
     csv_files: &mut BTreeMap<String, Vec<u8>>,
 ) -> Result<TestSet, ValueError> {
     let mut version = Version::D;
     let mut file = None;
+    let mut rows = None;
     let mut assignments: Vec<Assignment> = Vec::new();
     for (key, value) in table {
         match (key.as_str(), value) {
@@ -57,6 +64,8 @@ fn read_set(
                 version = text.parse().map_err(|_| ValueError::new(key, value, "\"D\", \"R\", \"E\" or \"R+E\""))?;
             }
             (FILE, Value::String(name)) => file = Some(name),
+            (ROWS, Value::Integer(number @ 1..)) => rows = Some(*number as usize),
+            (ROWS, _) => return Err(ValueError::new(key, value, "a number of rows, at least 1")),
             (VERSION | FILE, _) => return Err(ValueError::new(key, value, "a text")),
             (_, Value::String(text)) => assignments.push(format!("{key}={text}").parse()?),
             (_, Value::Integer(_) | Value::Float(_)) => assignments.push(format!("{key}={value}").parse()?),
@@ -66,13 +75,22 @@ fn read_set(
             }
         }
     }
-    let Some(file) = file else { return set_of(name, version, assignments) };
+    let Some(file) = file else {
+        require(rows.is_none(), ROWS, "given without file", "given with a CSV file")?;
+        return set_of(name, version, assignments);
+    };
     let expected = "alone: the file's header names the parameters";
     require(assignments.is_empty(), FILE, "given in addition to parameters", expected)?;
-    let content = read_csv_file(file).map_err(|got| ValueError::new(FILE, got, "a CSV file in the plan's folder"))?;
-    let set = set_of_csv(name, version, &content)?;
-    csv_files.insert(file.clone(), content);
-    Ok(set)
+    let expected = "the name of one file: no environment is known here";
+    require(environment.is_some() || !file.contains(ENVIRONMENT), FILE, format!("`{file}`"), expected)?;
+    let file = file.replace(ENVIRONMENT, environment.unwrap_or_default());
+    let content = read_csv_file(&file).map_err(|got| ValueError::new(FILE, got, "a CSV file in the plan's folder"))?;
+    let mut contexts = set_of_csv(name, version, &content)?.listed();
+    let (known, rows) = (contexts.len(), rows.unwrap_or(contexts.len()));
+    require(rows <= known, ROWS, rows, format!("at most {known}, the number of rows in {file}"))?;
+    contexts.truncate(rows);
+    csv_files.insert(file, content);
+    Ok(TestSet { name: name.into(), version, contexts: Contexts::Listed(contexts) })
 }
 
 /// Reads the CSV file `file` in `folder`. The error is a phrase for [`ReadCsvFile`].

@@ -273,6 +273,53 @@ fn marks_are_below_the_budget_and_change_cell_ids() {
 }
 
 #[test]
+fn trainings_on_a_list_have_its_first_rows() {
+    let text = "environments = ['CartPole', 'Pendulum']\nversions = ['few', 'all']\ntest_versions = ['R', 'few']
+        [sets]\nfew = { file = 'own-{environment}.csv', rows = 2 }\nall = { file = 'own-{environment}.csv', version = 'R' }
+        [[algorithm]]\nname = 'ppo'\narchitectures = ['ff']";
+    let csv_file = |name: &str| match name {
+        "own-CartPole.csv" => Ok(b"force\n5\n6\n7\n".to_vec()),
+        "own-Pendulum.csv" => Ok(b"length,mass\n1,2\n3,4\n5,6\n".to_vec()),
+        other => Err(format!("`{other}`")),
+    };
+    let parse = |text: &str| Plan::parse_with("plan.toml", text.into(), Path::new(""), &csv_file);
+    let plan = parse(text).unwrap();
+    let trained = |cell: &Cell| {
+        let common = &cell.config.common;
+        let values = common.contexts.iter().flat_map(|context| context.values().copied());
+        (common.environment.clone(), cell.trained_on().to_string(), common.version, values.collect::<Vec<_>>())
+    };
+    let expected = |environment: &str, set: &str, version, values: &[f64]| {
+        (environment.to_owned(), set.to_owned(), version, values.to_vec())
+    };
+    assert_eq!(
+        plan.cells.iter().map(trained).collect::<Vec<_>>(),
+        [
+            expected("CartPole", "few", Version::D, &[5.0, 6.0]),
+            expected("CartPole", "all", Version::R, &[5.0, 6.0, 7.0]),
+            expected("Pendulum", "few", Version::D, &[1.0, 2.0, 3.0, 4.0]),
+            expected("Pendulum", "all", Version::R, &[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]),
+        ]
+    );
+    for cell in &plan.cells {
+        let tested = cell.tests.sets.iter().find(|set| set.name == "few").unwrap();
+        assert!(cell.set.as_deref() != Some("few") || tested.listed() == cell.config.common.contexts);
+    }
+    assert!(plan.files().map(|(name, _)| name).eq(["own-CartPole.csv", "own-Pendulum.csv", "plan.toml"]));
+    let other = parse(&text.replace("rows = 2", "rows = 1")).unwrap();
+    assert!(plan.cells.iter().all(|cell| other.find(&cell.id).is_none()), "the tests differ, too");
+    for (from, to, part) in [
+        ("rows = 2", "rows = 4", "rows is 4, but must be at most 3, the number of rows in own-CartPole.csv"),
+        ("rows = 2", "rows = 0", "rows is 0, but must be a number of rows"),
+        ("file = 'own-{environment}.csv', rows", "force = 5, rows", "rows is given without file"),
+        ("own-{environment}", "their-{environment}", "file is `their-CartPole.csv`"),
+    ] {
+        let message = parse(&text.replacen(from, to, 1)).unwrap_err().to_string();
+        assert!(message.contains(part), "{to}: {message}");
+    }
+}
+
+#[test]
 fn a_cell_asked_for_twice_is_refused() {
     let message = parse(&format!("{SMALL}\n[[algorithm]]\nname = 'ppo'\narchitectures = ['ff']\nversions = ['E']"))
         .unwrap_err()

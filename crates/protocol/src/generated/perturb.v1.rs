@@ -401,8 +401,8 @@ pub struct Open {
     #[prost(bool, tag = "10")]
     pub reward_terms: bool,
     /// Groups of consecutive environments, each with its own settings. They replace `version`, `parameters`, `batch_size`,
-    /// `seed`, `first_environment_index` and `episodes_per_trial`, which must then not be set. The environments of a group
-    /// give the same bytes as in a session of their own.
+    /// `seed`, `first_environment_index`, `episodes_per_trial` and `contexts`, which must then not be set. The environments
+    /// of a group give the same bytes as in a session of their own.
     #[prost(message, repeated, tag = "11")]
     pub groups: ::prost::alloc::vec::Vec<SlotGroup>,
     /// Whether every observation, including first and final ones, ends with the parameters of its episode, scaled as
@@ -420,6 +420,24 @@ pub struct Open {
     /// request, the client confirms that it has received all replies except the last W - 1.
     #[prost(uint32, tag = "14")]
     pub lease: u32,
+    /// The contexts of the trials. If absent, trials have no contexts.
+    #[prost(message, optional, tag = "15")]
+    pub contexts: ::core::option::Option<Contexts>,
+}
+/// A list of contexts: combinations of values of some parameters. Each trial has the values of one context. All contexts
+/// are equally likely. Parameters that are not named are drawn as without contexts. A later `reset` may replace the
+/// distribution of any parameter; the new distribution then applies in all contexts.
+#[derive(Clone, PartialEq, ::prost::Message)]
+pub struct Contexts {
+    /// The names of the parameters, at least one, all different. A parameter that is named here must not also be in
+    /// `parameters`. Disturbances may be named as in `parameters`.
+    #[prost(string, repeated, tag = "1")]
+    pub names: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
+    /// The values \[contexts, names\], for 1 … 1024 contexts. The distributions of one environment may take at most 216 KiB:
+    /// each parameter takes 1 byte and 16 bytes for each interval, in each context. In version R+E they take twice as
+    /// much. So there is always room for 1024 contexts of 12 parameters with fixed values.
+    #[prost(double, repeated, tag = "2")]
+    pub values: ::prost::alloc::vec::Vec<f64>,
 }
 /// A group of consecutive environments of a session, with settings as in `Open`.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -445,6 +463,9 @@ pub struct SlotGroup {
     /// The number of episodes in a trial; 0 means 1.
     #[prost(uint32, tag = "6")]
     pub episodes_per_trial: u32,
+    /// The contexts of the trials. If absent, trials have no contexts.
+    #[prost(message, optional, tag = "7")]
+    pub contexts: ::core::option::Option<Contexts>,
 }
 /// The session is open, and every environment is at the start of its first episode.
 #[derive(Clone, PartialEq, ::prost::Message)]
@@ -485,9 +506,13 @@ pub struct Opened {
     #[prost(uint64, tag = "10")]
     pub max_step_reply_bytes: u64,
     /// Upper bound of the size of a reply to `snapshot` of all N environments, in bytes. If a later request replaces a
-    /// distribution by one with more intervals, each additional interval adds 16 bytes. 0 from older servers.
+    /// distribution by one with more intervals, each additional interval adds 16 bytes, in every context. 0 from older
+    /// servers.
     #[prost(uint64, tag = "11")]
     pub max_snapshot_reply_bytes: u64,
+    /// Whether this server supports `Open.contexts` and `SlotGroup.contexts`; false from older servers.
+    #[prost(bool, tag = "12")]
+    pub supports_contexts: bool,
 }
 /// Resumes a session with a lease, as the first request of a new stream. If the server has not noticed the loss of the
 /// old stream yet, the old stream ends with ABORTED. The session is unchanged; requests that the server has read

@@ -25,6 +25,7 @@ pub(super) fn defaults_for(mut settings: Settings, architecture: Architecture, p
         environment: String::new(),
         version: Version::D,
         parameters: Default::default(),
+        contexts: Vec::new(),
         architecture,
         observe: Default::default(),
         episodes: 15_000,

@@ -32,15 +32,18 @@ use serde::{Deserialize, Serialize};
 use toml::{Table, Value};
 
 use perturb_files as files;
+use perturb_protocol::limits::MAX_DRAWN_CONTEXTS;
 use perturb_protocol::{Distribution, Version, names};
 
-use crate::sets::Parameters;
+use crate::sets::{Context, Contexts, Parameters, TestSet};
 use crate::value_error::{ValueError, require};
 
 /// Maximal number of environments of one training.
 const MAX_ENVS: usize = 65_536;
 /// The key of [`Common::parameters`] in a configuration.
 const PARAMETERS: &str = "parameters";
+/// The key of [`Common::contexts`] in a configuration.
+const CONTEXTS: &str = "contexts";
 /// The key of the algorithm, [`Settings::name`], in a configuration.
 const ALGORITHM: &str = "algorithm";
 /// The key of [`Common::preset`] in a configuration.
@@ -51,14 +54,45 @@ const OBSERVE: &str = "observe";
 const ARCHITECTURE: &str = "architecture";
 
 impl Common {
-    /// Describes the parameters of the training: the version, and the parameters that replace the version's, e.g. "D"
-    /// or "D with length [0.3, 0.4]".
+    /// Describes the parameters of the training: the version, the parameters that replace the version's, and the
+    /// contexts, e.g. "D", "D with length [0.3, 0.4]" or "R with 16 contexts of length, mass".
     pub fn trained_on(&self) -> String {
         let own = self.parameters.iter().map(|(name, values)| format!("{name} {values}"));
-        match own.collect::<Vec<_>>() {
+        let listed = self.contexts.first().map(|context| {
+            let names: Vec<&str> = context.keys().map(String::as_str).collect();
+            format!("{} contexts of {}", self.contexts.len(), names.join(", "))
+        });
+        match own.chain(listed).collect::<Vec<_>>() {
             own if own.is_empty() => self.version.to_string(),
             own => format!("{} with {}", self.version, own.join(", ")),
         }
+    }
+
+    /// Returns the set of parameters that the training draws from, with this name.
+    pub fn training_set(&self, name: &str) -> TestSet {
+        let contexts = match self.contexts.as_slice() {
+            [] => Contexts::Drawn(self.parameters.clone()),
+            contexts => Contexts::Listed(contexts.to_vec()),
+        };
+        TestSet { name: name.into(), version: self.version, contexts }
+    }
+
+    /// Returns the names of the parameters whose values the training determines itself.
+    pub fn parameter_names(&self) -> impl Iterator<Item = &str> {
+        let listed = self.contexts.first().into_iter().flat_map(Context::keys);
+        self.parameters.keys().chain(listed).map(String::as_str)
+    }
+
+    fn validate_contexts(&self) -> Result<(), ValueError> {
+        let Some(first) = self.contexts.first() else { return Ok(()) };
+        let count = self.contexts.len();
+        require(count <= MAX_DRAWN_CONTEXTS, CONTEXTS, count, format!("at most {MAX_DRAWN_CONTEXTS} contexts"))?;
+        let is_like_first = |context: &Context| context.keys().eq(first.keys());
+        let expected = "a list of values of the same parameters, at least one, in each context";
+        let is_complete = !first.is_empty() && self.contexts.iter().all(is_like_first);
+        require(is_complete, CONTEXTS, "without values of some parameters", expected)?;
+        let expected = "alone: add the values of these parameters to each context";
+        require(self.parameters.is_empty(), CONTEXTS, "given in addition to parameters", expected)
     }
 }
 
@@ -86,6 +120,11 @@ pub struct Common {
     /// `length = "0.8..1.0"` in the table `[parameters]` (default: nothing).
     #[serde(default, skip_serializing_if = "Parameters::is_empty")]
     pub parameters: Parameters,
+    /// Contexts of the training, 1 … 1024 (default: nothing). Each trial has the values of one of them; all are equally
+    /// likely. All contexts have the same parameters; the others are drawn from `version`. Not together with `parameters`.
+    /// An example is `contexts = [{ length = 0.3 }, { length = 0.5 }]`.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub contexts: Vec<Context>,
     /// The network architecture of the policy.
     pub architecture: Architecture,
     /// The observation of the policy in training and in tests: "state", or "parameters" for the state and the current
@@ -234,6 +273,7 @@ impl TrainConfig {
             let expected = if most == u64::MAX { "at least 1".to_owned() } else { format!("between 1 and {most}") };
             require((1..=most).contains(&value), key, value, expected)?;
         }
+        self.common.validate_contexts()?;
         let noise = self.common.observation_noise;
         require((0.0..=100.0).contains(&noise), "observation_noise", noise, "a standard deviation, 0 … 100")?;
         let rate = self.common.stop_at_success;
@@ -325,6 +365,7 @@ fn defaults_of(config: &TrainConfig) -> Table {
     let mut defaults = config.full_table();
     // `full_table` leaves out these settings if they have their defaults, so they are added here.
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
+    defaults.insert(CONTEXTS.into(), Value::Array(Vec::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
     if !config.settings.is_random() {
         defaults.insert("observation_noise".into(), 0.0.into());
@@ -428,6 +469,8 @@ fn check(origin: &str, key: &str, value: &Value, defaults: &Table, algorithm: &'
         (Value::Boolean(_), Value::Boolean(_)) | (Value::String(_), Value::String(_)) => return Ok(()),
         (Value::Table(_), Value::Table(parameters)) => return check_parameters(parameters),
         (Value::Table(_), _) => "a table of parameters and their values",
+        (Value::Array(_), contexts) if contexts.clone().try_into::<Vec<Context>>().is_ok() => return Ok(()),
+        (Value::Array(_), _) => "a list of contexts, such as [{ length = 0.3 }, { length = 0.5 }]",
         (Value::Float(_), _) => "a number",
         (Value::Integer(_), Value::Float(number)) if number.fract() == 0.0 && (0.0..1e15).contains(number) => {
             let expected = format!("a whole number that is not negative, in digits: {number}");

@@ -290,6 +290,29 @@ fn what_is_observed_is_written_only_where_it_is_not_the_default() {
     assert!(message.contains("observe is \"everything\", but must be one of \"state\", \"parameters\""), "{message}");
 }
 
+#[test]
+fn contexts_are_written_and_list_the_same_parameters() {
+    let listed = "contexts=[{ length = 0.1, mass = 2 }, { length = 0.30000000000000004, mass = 1e-3 }]";
+    let config = of("perturb", "ppo", Architecture::Ff, &[listed]);
+    let lengths: Vec<f64> = config.common.contexts.iter().map(|context| context["length"]).collect();
+    assert_eq!(lengths, [0.1, 0.1 + 0.2]);
+    assert_eq!(config.common.trained_on(), "D with 2 contexts of length, mass");
+    assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+    assert!(!of("perturb", "ppo", Architecture::Ff, &[]).full_table().contains_key("contexts"));
+    let many = format!("contexts=[{}]", "{ length = 1 },".repeat(1025));
+    for (sets, expected) in [
+        (&["contexts=[{ length = 'x' }]"][..], "contexts is [{ length = \"x\" }], but must be a list of contexts"),
+        (&["contexts=5"], "but must be a list of contexts"),
+        (&["contexts=[{}]"], "at least one, in each context"),
+        (&["contexts=[{ length = 1 }, { mass = 1 }]"], "values of the same parameters"),
+        (&["contexts=[{ length = 1 }]", "parameters={ mass = 1 }"], "contexts is given in addition to parameters"),
+        (&[&many], "contexts is 1025, but must be at most 1024"),
+    ] {
+        let message = refusal(None, sets);
+        assert!(message.contains(expected), "{message}");
+    }
+}
+
 /// Returns the ten pairs of algorithm and architecture of Packer et al. (2018).
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));

@@ -73,7 +73,7 @@ pub(super) fn create(
     let episodes = env::EpisodeSettings {
         seed: integer(SEED, 0, 0, u64::MAX)?,
         environment_index: small(ENVIRONMENT_INDEX, 0, 0)?,
-        distributions,
+        distributions: distributions.into(),
         episodes_per_trial: small(EPISODES_PER_TRIAL, 1, 1)?,
     };
     // The runner itself resets the environment at the agent's first step after the end of an episode.

@@ -24,7 +24,7 @@ pub(super) struct World {
 struct PendingChanges {
     version: Version,
     /// The distribution of each parameter.
-    distributions: Vec<Distribution>,
+    distributions: Arc<[Distribution]>,
     /// Whether the distributions were set since the running episode began.
     new_distributions: bool,
     seed: Option<u64>,
@@ -43,7 +43,7 @@ impl World {
     pub(super) fn new(name: String, runner: &Runner) -> Self {
         let pending = PendingChanges {
             version: runner.version(),
-            distributions: runner.episodes().distributions.clone(),
+            distributions: Arc::clone(&runner.episodes().distributions),
             new_distributions: false,
             seed: None,
             interruption: false,
@@ -71,11 +71,11 @@ impl World {
         if change.version.is_some() || !change.parameters.is_empty() {
             let mut distributions = match change.version {
                 Some(version) => self.spec.distributions(version),
-                None => pending.distributions.clone(),
+                None => pending.distributions.to_vec(),
             };
             resolve(self.spec, &mut distributions, change.parameters)?;
             self.draws.check(self.spec, &distributions)?;
-            (pending.distributions, pending.new_distributions) = (distributions, true);
+            (pending.distributions, pending.new_distributions) = (distributions.into(), true);
         }
         pending.version = version;
         pending.seed = change.seed.or(pending.seed);
@@ -90,7 +90,7 @@ impl World {
         Changes {
             version: pending.version,
             seed: pending.seed.take(),
-            distributions: new.then(|| pending.distributions.clone().into()),
+            distributions: new.then(|| Arc::clone(&pending.distributions)),
         }
     }
 

@@ -5,16 +5,19 @@ use super::Error;
 use crate::{
     env::{
         self, Achievement, ActionSpec, Catalogue, ChannelSpec, Distribution, EnvironmentSpec, EpisodeId,
-        EpisodeReceipt, EpisodeSettings, FinishedEpisode, ParameterSpec, StartedEpisode, SuccessComparison,
-        SuccessRuleSpec, Version, disturbance, resolve,
+        EpisodeReceipt, EpisodeSettings, FinishedEpisode, Interval, ParameterSpec, StartedEpisode, SuccessComparison,
+        SuccessRuleSpec, Version, disturbance, resolve, shorten,
     },
     pool::{Autoreset, Batch, BatchSettings, ResetEntry, SlotGroupSettings, StepResult},
     proto,
     render::Size,
 };
 use bytes::Bytes;
-use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, PICTURE_PIXELS};
-use std::{collections::HashMap, sync::Arc};
+use perturb_protocol::limits::{DEFAULT_PICTURE_PIXELS, MAX_DRAWN_CONTEXTS, PICTURE_PIXELS};
+use std::{
+    collections::{HashMap, HashSet},
+    sync::Arc,
+};
 
 /// Checks an `open` request, and converts it to the settings of its batch. `max_envs` is the server's maximum number of
 /// environments. It also limits the number of groups.
@@ -54,9 +57,12 @@ pub fn open(catalogue: &Catalogue, max_envs: usize, request: proto::Open) -> Res
 /// Returns the description of the environment that an `open` requests. If the `open` names a disturbance, all
 /// disturbances are added to the environment's parameters.
 fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result<&'static EnvironmentSpec, Error> {
-    let groups = open.groups.iter().map(|group| &group.parameters);
-    let mut names: Vec<&str> =
-        groups.chain([&open.parameters]).flat_map(|named| named.keys().map(String::as_str)).collect();
+    let groups = open.groups.iter().map(|group| (&group.parameters, &group.contexts));
+    let all = groups.chain([(&open.parameters, &open.contexts)]);
+    let names = all.flat_map(|(parameters, contexts)| {
+        parameters.keys().chain(contexts.iter().flat_map(|contexts| &contexts.names)).map(String::as_str)
+    });
+    let mut names: Vec<&str> = names.collect();
     // The names are sorted, so that the same request always gets the same error.
     names.sort_unstable();
     Ok(disturbance::with_parameters(spec, names)?)
@@ -64,9 +70,15 @@ fn with_parameters(spec: &'static EnvironmentSpec, open: &proto::Open) -> Result
 
 /// Converts an `open` without groups to a single group.
 fn single(request: proto::Open) -> proto::SlotGroup {
-    let proto::Open { version, parameters, batch_size, seed, first_environment_index, episodes_per_trial, .. } =
-        request;
-    proto::SlotGroup { size: batch_size, version, parameters, seed, first_environment_index, episodes_per_trial }
+    proto::SlotGroup {
+        size: request.batch_size,
+        version: request.version,
+        parameters: request.parameters,
+        seed: request.seed,
+        first_environment_index: request.first_environment_index,
+        episodes_per_trial: request.episodes_per_trial,
+        contexts: request.contexts,
+    }
 }
 
 /// Checks that an `open` with groups does not also use the fields that groups replace.
@@ -78,6 +90,7 @@ fn check_no_single(request: &proto::Open) -> Result<(), Error> {
         ("open.seed", request.seed != 0),
         ("open.first_environment_index", request.first_environment_index != 0),
         ("open.episodes_per_trial", request.episodes_per_trial != 0),
+        ("open.contexts", request.contexts.is_some()),
     ];
     match given.into_iter().find(|(_, given)| *given) {
         Some((field, _)) => Err(Error::value(field, "given in addition to open.groups", "it only inside each group")),
@@ -106,14 +119,51 @@ fn group(
         return Err(Error::value(field, got, "the last environment's index below 2^32"));
     }
     let mut distributions = spec.distributions(version);
+    if let Some(contexts) = &group.contexts {
+        distributions = with_contexts(spec, &format!("{path}.contexts"), &distributions, contexts, &group.parameters)?;
+    }
     override_parameters(spec, &mut distributions, &group.parameters)?;
     let episodes = EpisodeSettings {
         seed: group.seed,
         environment_index: first,
-        distributions,
+        distributions: distributions.into(),
         episodes_per_trial: group.episodes_per_trial.max(1),
     };
     Ok(SlotGroupSettings { size: group.size as usize, episodes })
+}
+
+/// Checks contexts, and returns their distributions. `base` has the distributions of the version, and `parameters` those
+/// that the group names besides its contexts. `path` is the field path of the contexts in errors.
+fn with_contexts<'a>(
+    spec: &'static EnvironmentSpec,
+    path: &str,
+    base: &[Distribution],
+    proto::Contexts { names, values }: &'a proto::Contexts,
+    parameters: &HashMap<String, proto::Distribution>,
+) -> Result<Vec<Distribution>, Error> {
+    let mut known = HashSet::new();
+    if let Some(twice) = names.iter().find(|name| !known.insert(*name) || parameters.contains_key(*name)) {
+        let expected = "each parameter once, either in contexts or in parameters";
+        return Err(Error::value(format!("{path}.names"), format!("{:?} twice", shorten(twice)), expected));
+    }
+    let rows = values.chunks(names.len().max(1));
+    if names.is_empty() || !(1..=MAX_DRAWN_CONTEXTS).contains(&rows.len()) || !values.len().is_multiple_of(names.len())
+    {
+        let got = format!("{} numbers for {} names", values.len(), names.len());
+        let expected = format!("a value of each parameter in 1 … {MAX_DRAWN_CONTEXTS} contexts");
+        return Err(Error::value(format!("{path}.values"), got, expected));
+    }
+    let mut distributions = Vec::new();
+    for row in rows {
+        let fixed = |(name, &value): (&'a String, &f64)| {
+            let distribution = Distribution::union(&[Interval::new(value, value)]);
+            Ok((name.as_str(), distribution.map_err(env::Error::in_distribution(name))?))
+        };
+        let mut of_row = base.to_vec();
+        resolve(spec, &mut of_row, names.iter().zip(row).map(fixed).collect::<Result<Vec<_>, env::Error>>()?)?;
+        distributions.append(&mut of_row);
+    }
+    Ok(distributions)
 }
 
 /// Replaces the distributions in `base` of all parameters that `parameters` names.
@@ -192,18 +242,18 @@ pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Er
     }
     let mut states = states(spec, &request.states, slots.len())?.into_iter();
     // Successive environments mostly have the same distributions, so the result of the last override is reused.
-    let mut edited: (Vec<Distribution>, Arc<[Distribution]>) = (Vec::new(), Arc::new([]));
+    let mut edited: [Arc<[Distribution]>; 2] = [Arc::new([]), Arc::new([])];
     let mut entries = Vec::with_capacity(slots.len());
     for (i, slot) in slots.into_iter().enumerate() {
         let mut distributions = None;
         if !request.parameters.is_empty() {
             let old = batch.distributions(slot);
-            if old != edited.0 {
-                let mut new = old.clone();
+            if old != edited[0] {
+                let mut new = old.to_vec();
                 override_parameters(spec, &mut new, &request.parameters)?;
-                edited = (old, new.into());
+                edited = [old, new.into()];
             }
-            distributions = Some(Arc::clone(&edited.1));
+            distributions = Some(Arc::clone(&edited[1]));
         }
         entries.push(ResetEntry { slot, seed: request.seeds.get(i).copied(), distributions, state: states.next() });
     }

@@ -8,10 +8,15 @@ use crate::server::transport::precheck::{
 
 const DISTRIBUTION: &[Field] = &[field(1, "intervals", Cardinality::Many, Opaque)];
 const PARAMETER: &[Field] = &[field(2, "a distribution", Cardinality::One, Fields(DISTRIBUTION))];
-const GROUP: &[Field] = &[field(3, "open.groups.parameters", Cardinality::Many, Fields(PARAMETER))];
+const CONTEXTS: &[Field] = &[field(1, "contexts.names", Cardinality::Many, Opaque)];
+const GROUP: &[Field] = &[
+    field(3, "open.groups.parameters", Cardinality::Many, Fields(PARAMETER)),
+    field(7, "open.groups.contexts", Cardinality::One, Fields(CONTEXTS)),
+];
 const OPEN: &[Field] = &[
     field(3, "open.parameters", Cardinality::Many, Fields(PARAMETER)),
     field(11, "open.groups", Cardinality::Environments, Fields(GROUP)),
+    field(15, "open.contexts", Cardinality::One, Fields(CONTEXTS)),
 ];
 const RESET: &[Field] = &[
     field(2, "reset.seeds", Cardinality::Environments, Numbers),

@@ -143,6 +143,7 @@ impl Session {
             lease_seconds,
             max_step_reply_bytes,
             max_snapshot_reply_bytes,
+            supports_contexts: true,
         };
         (self.batch, self.step_memory, self.env_quota) = (Some(batch), step_memory, env_quota);
         Ok(Reply { handover: grant.map(StreamHandover::Lease), ..reply(Response::Opened(opened)) })

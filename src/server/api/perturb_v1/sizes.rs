@@ -16,6 +16,8 @@ const MAX_VARINT_FIELD_BYTES: usize = 11;
 /// The estimated memory of an ended episode without a receipt, bytes. The episode is in memory twice: as a value, and
 /// encoded in the reply.
 const EPISODE_END_BYTES: usize = 300;
+/// The estimated memory of a distribution, which mostly has one or two intervals, bytes.
+const DISTRIBUTION_BYTES: usize = 72;
 /// The estimated memory of an ended or started episode with a receipt, without the receipt's numbers, bytes.
 const RECEIPT_OVERHEAD_BYTES: usize = 400;
 /// An upper bound of the total length of a reply's tags, lengths and non-repeated fields, bytes.
@@ -55,14 +57,16 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// Returns the memory that a session reserves when it is opened, bytes: two step requests and three replies (one being
-/// computed, one waiting, one being sent). With this reservation, no step is refused because of the memory that other
+/// Returns the memory that a session reserves when it is opened, bytes: the distributions of all groups, two step
+/// requests, and three replies (one being computed, one waiting, one being sent). With this reservation, no step is refused because of the memory that other
 /// sessions use.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * receipt_bytes(settings) } else { EPISODE_END_BYTES };
     let reply = envs.saturating_mul(4 * numbers + 2 + ends);
-    step_request(settings, envs).saturating_mul(2).saturating_add(reply.saturating_mul(3))
+    let distributions: usize = settings.groups.iter().map(|group| group.episodes.distributions.len()).sum();
+    let fixed = distributions.saturating_mul(DISTRIBUTION_BYTES);
+    fixed.saturating_add(step_request(settings, envs).saturating_mul(2)).saturating_add(reply.saturating_mul(3))
 }
 
 /// Returns the memory that these snapshots take, bytes.
