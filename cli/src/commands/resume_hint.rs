@@ -42,7 +42,7 @@ pub(super) fn with_resume_command(error: TrainError, play: &PlayArgs) -> Command
         TrainError::Failed { last: Some(LastCheckpoint { run, .. }), source }
             if !matches!(**source, TrainError::Numbers(_)) =>
         {
-            CommandError::Failed(format!("{error}; resume it with: {}", resume_command(run, play)))
+            CommandError::Failed(format!("{error}; to go on with the training: {}", resume_command(run, play)))
         }
         _ => error.into(),
     }

@@ -295,7 +295,9 @@ fn a_killed_server_ends_the_training_with_a_checkpoint() {
     let message = stderr(&output);
     assert!(message.contains("lost the server at unix:") && message.contains("signal: 9"), "{message}");
     let episodes = Checkpoint::load(out.path()).expect("a whole checkpoint").state.counters.episodes;
-    let kept = format!("the checkpoint after {episodes} episodes is kept in {path}; resume it with: perturb train");
+    let kept = format!(
+        "the checkpoint after {episodes} episodes is kept in {path}; to go on with the training: perturb train"
+    );
     assert!(message.contains(&kept), "{message}");
 }
 

@@ -199,7 +199,7 @@ fn each_misuse_is_refused_with_a_remedy_and_leaves_nothing() {
 #[case::train(
     "perturb train --env CartPole --episodes 1000000 --out run",
     "run/progress.csv",
-    "stopped by signal N after N of N episodes; resume it with: perturb train --resume run",
+    "stopped by signal N after N of N episodes; to go on with the training: perturb train --resume run",
     "run, run/checkpoint, run/config.toml, run/events.out.tfevents.N.perturb, run/lock, run/monitor.csv, run/progress.csv"
 )]
 #[case::run(
@@ -318,7 +318,7 @@ fn a_lost_server_is_reported_with_the_resume_command() {
     assert!(said.starts_with(&format!("perturb: lost the server at {address} ")), "{said}");
     assert!(said.contains("; the checkpoint after ") && !said.contains("h2") && !said.contains("transport"), "{said}");
     let again = format!("perturb train --resume 'my run' --server {address} --server-wait 0");
-    let command = format!("episodes is kept in my run; resume it with: {again}\n");
+    let command = format!("episodes is kept in my run; to go on with the training: {again}\n");
     assert!(said.ends_with(&command), "{said}");
 }
 

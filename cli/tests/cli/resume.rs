@@ -359,7 +359,7 @@ fn a_training_that_lost_its_server_says_how_to_go_on() {
     assert_eq!(output.status.code(), Some(1), "{}", stderr(&output));
     let kept = episodes(out.path());
     let expected = format!(
-        "the checkpoint after {kept} episodes is kept in {path}; resume it with: perturb train --resume {path} \
+        "the checkpoint after {kept} episodes is kept in {path}; to go on with the training: perturb train --resume {path} \
          --server-wait 0"
     );
     assert!(stderr(&output).contains(&expected), "{}", stderr(&output));

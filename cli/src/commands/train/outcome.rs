@@ -41,7 +41,7 @@ pub(super) fn finish(
     }
     if let Some(number) = outcome.signal {
         note(format_args!(
-            "stopped by signal {number} after {} of {} episodes; resume it with: {}",
+            "stopped by signal {number} after {} of {} episodes; to go on with the training: {}",
             outcome.progress.episodes,
             config.common.episodes,
             resume_command(directory.path(), &args.play)
