@@ -92,7 +92,8 @@ impl DrawAuditor {
         if self.is_exempt() {
             return Ok(PendingDraws::default());
         }
-        let (mut previous, mut starts): (_, Vec<(Draw, Arc<[Distribution]>)>) = (Vec::new(), Vec::new());
+        let mut previous = Vec::new();
+        let mut starts: Vec<(Draw, Arc<[Distribution]>)> = Vec::new();
         for ResetEntry { slot, seed, distributions, .. } in entries {
             if seed.is_none() && distributions.is_none() {
                 continue; // the reset continues the current sequence of draws
