@@ -202,8 +202,8 @@ impl PythonSession {
             // Receipts of a batch come as arrays, which are cheaper than a message for each episode. For a single
             // environment, messages are as cheap as arrays.
             receipt_arrays: receipts && !self.actions.single,
-            groups: Vec::new(),
-            lease: 0, // the session cannot be resumed after its connection is lost
+            // In particular, the session has no lease, so it cannot be resumed after its connection is lost.
+            ..proto::Open::default()
         };
         {
             let mut state = self.state();
