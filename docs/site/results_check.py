@@ -13,6 +13,7 @@ from pathlib import Path
 
 import perturb
 import results_given
+import results_lines
 import results_pages
 from results_numbers import Studies
 from results_words import Near, Pattern
@@ -33,6 +34,7 @@ PAGES = {
     "docs/findings/paper-claims.md": results_pages.claims,
     "docs/findings/pendulum-ppo.md": results_pages.pendulum,
     "docs/findings/recurrent.md": results_pages.recurrent,
+    "docs/findings/reference-lines.md": results_lines.reference_lines,
     "docs/findings/rl2-trials.md": results_pages.rl2,
 }
 # The part of README.md that has results: its first heading, and the first heading after it.

@@ -91,6 +91,7 @@ STUDIES = {
     "[questions/findings] |": ("questions/findings", None),
     "[beyond], [nine studies] |": ("beyond/", None),
     "[locomotion] |": ("locomotion", 72),
+    "[heuristic] |": ("heuristic", None),
     "locomotion-rate |": ("locomotion-rate", None),
     "classic |": ("classic", 72),
 }

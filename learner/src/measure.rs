@@ -100,8 +100,8 @@ pub fn measure(
     })
 }
 
-/// Measures one job: trains the group in the folder `scratch`, then tests one policy. A random policy needs no training
-/// and is only tested.
+/// Measures one job: trains the group in the folder `scratch`, then tests one policy. A policy that does not learn
+/// is only tested.
 fn measure_one(
     servers: &Servers,
     group: &[&Cell],
@@ -109,7 +109,7 @@ fn measure_one(
     limit: Duration,
     stop: &StopFlag,
 ) -> Result<Speed, MeasureError> {
-    if group[0].config.settings.is_random() {
+    if !group[0].config.settings.learns() {
         let directory = RunDirectory::choose(scratch, true)?;
         let made = train(servers, &group[0].config, &directory, 1, &StopFlag::default(), |_| {})?;
         return Ok(Speed { training: 0.0, testing: measure_test(servers, group[0], &made.checkpoint, stop)? });

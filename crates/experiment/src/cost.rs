@@ -119,10 +119,10 @@ pub fn estimates(plan: &Plan, measurements: &[Measurement], step_limits: &HashMa
 }
 
 /// Returns the number of episodes that a training generates until `counted` of them count towards its budget. EPOpt
-/// generates more episodes than it counts, because only the worst ones count. The random policy, which is not trained,
-/// generates 0.
+/// generates more episodes than it counts, because only the worst ones count. A policy that does not learn generates
+/// 0.
 pub fn generated_episodes(config: &TrainConfig, counted: u64) -> f64 {
-    if config.settings.is_random() {
+    if !config.settings.learns() {
         return 0.0;
     }
     let budget = counted as f64;

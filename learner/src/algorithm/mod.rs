@@ -127,7 +127,7 @@ pub fn build(settings: &Settings, policy: &TrainablePolicy, seed: u64) -> Result
     let base: Box<dyn BaseAlgorithm> = match &settings.base {
         Base::A2c(settings) => Box::new(A2c::new(settings.clone(), policy)?),
         Base::Ppo(settings) => Box::new(Ppo::new(settings.clone(), policy, seed)?),
-        Base::Random => unreachable!("a random policy is made, not trained"),
+        Base::Random | Base::Heuristic => unreachable!("this policy is made, not trained"),
     };
     Ok(match &settings.wrapper {
         Wrapper::Plain | Wrapper::Rl2(_) => base,

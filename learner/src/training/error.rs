@@ -41,6 +41,12 @@ pub enum TrainError {
         /// The upper bound.
         high: f64,
     },
+    /// There is no heuristic policy for the environment.
+    #[error("there is no heuristic policy for {environment}; CartPole, MountainCar, Acrobot and Pendulum have one")]
+    NoHeuristic {
+        /// The name of the environment.
+        environment: String,
+    },
     /// A log cannot be continued.
     #[error(transparent)]
     Log(#[from] LogError),

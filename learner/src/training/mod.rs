@@ -15,11 +15,12 @@ mod client_side;
 mod ending;
 mod entry;
 mod error;
-mod random;
+mod heuristic;
 mod run_directory;
 mod server_side;
 mod start;
 mod trainer;
+mod untrained;
 
 use std::time::Duration;
 
@@ -147,10 +148,10 @@ pub fn train_together(
     report: &mut dyn FnMut(usize, &Progress),
     ended: &mut dyn FnMut(usize, Result<TrainOutcome>),
 ) -> Result<()> {
-    let is_random = |(_, entry): &(usize, TrainRequest<'_>)| entry.start.config().settings.is_random();
-    let (random, entries): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(is_random);
-    for (index, entry) in random {
-        ended(index, random::make(servers, &entry));
+    let learns = |(_, entry): &(usize, TrainRequest<'_>)| entry.start.config().settings.learns();
+    let (entries, untrained): (Vec<_>, Vec<_>) = entries.into_iter().enumerate().partition(learns);
+    for (index, entry) in untrained {
+        ended(index, untrained::make(servers, &entry));
     }
     let (mut server_side, runs, others) = ServerSide::open(servers, entries, threads, ended)?;
     train_loop(servers, &mut server_side, runs, stop, report, ended)?;

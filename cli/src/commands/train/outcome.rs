@@ -36,7 +36,7 @@ pub(super) fn finish(
         }
         Err(error) => return Err(with_resume_command(error, &args.play)),
     };
-    if !config.settings.is_random() {
+    if config.settings.learns() {
         summarise(&outcome.progress);
     }
     if let Some(number) = outcome.signal {

@@ -1,4 +1,5 @@
-//! Cells for comparison in reports: the random policy, policies that observe parameters, and training on R+E.
+//! Cells for comparison in reports: the random policy, heuristic policies, policies that observe parameters, and
+//! training on R+E.
 
 use perturb_settings::Observe;
 
@@ -49,6 +50,38 @@ fn random_policies_are_tested_reported_and_replayed() {
     assert!(text.contains("random policy (reference)"), "{text}{}", stderr(&output));
     let output = perturb(&["plan", "--measure", "1", "--jobs", "1"]).arg(experiment.out("file.toml")).output();
     succeeded(&output.expect("ended"));
+}
+
+/// A plan with one cell of each heuristic policy.
+const HEURISTIC: &str = "
+environments = ['CartPole', 'MountainCar', 'Acrobot', 'Pendulum']
+versions = ['D']
+test_versions = ['D', 'R', 'E']
+test_episodes = 100
+
+[[algorithm]]
+name = 'heuristic'
+architectures = ['ff']
+";
+
+#[test]
+fn heuristic_policies_are_tested_reported_and_replayed() {
+    let experiment = Experiment::new(HEURISTIC);
+    succeeded(&experiment.run("out", &["--jobs", "1"]));
+    // The bounds are three standard deviations of 100 episodes below the success rates of many episodes.
+    for (index, bounds) in
+        [[100.0, 100.0, 91.0], [26.0, 74.0, 83.0], [47.0, 37.0, 36.0], [97.0, 97.0, 91.0]].into_iter().enumerate()
+    {
+        let results = experiment.cell_result("out", index).results;
+        for (version, bound) in ["D", "R", "E"].into_iter().zip(bounds) {
+            assert!(results[version].success_percent >= bound, "cell {index}, {version}: {:?}", results[version]);
+        }
+    }
+    let output = perturb(&["audit", "--all"]).arg(experiment.out("out")).output().expect("ended");
+    assert!(output.stdout.starts_with(b"1200 of 1200 episodes of 4 policies"), "{output:?}");
+    let output = perturb(&["report"]).arg(experiment.out("out")).output().expect("ended");
+    let text = String::from_utf8_lossy(&output.stdout).into_owned();
+    assert!(text.contains("heuristic policy (reference)"), "{text}{}", stderr(&output));
 }
 
 /// A plan with four cells: PPO that does not observe parameters, and PPO, RL²-PPO and the random policy that observe

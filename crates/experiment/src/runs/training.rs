@@ -53,7 +53,7 @@ impl TrainingStatus {
         let saved = checkpoint.ok().map(|state| state.counters.episodes);
         let (budget, stop) = (config.common.episodes, config.common.stop_at_success);
         let success = progress.as_ref().and_then(LastProgress::success_percent);
-        let enough = stop > 0.0 && success >= Some(stop) || config.settings.is_random() && saved.is_some();
+        let enough = stop > 0.0 && success >= Some(stop) || !config.settings.learns() && saved.is_some();
         let state = match saved.unwrap_or_default() {
             _ if is_locked(path) => "in work",
             saved if saved >= budget || enough => "finished",

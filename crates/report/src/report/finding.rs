@@ -124,10 +124,10 @@ impl<'a> Report<'a> {
 /// Returns sentences that name the method with the best Extrapolation and the next one, and compare Extrapolation with
 /// Default. Returns `None` if no method has Extrapolation. If several methods have the highest rounded number, they
 /// share the first place and none is called best. If a method has a single run, no method is called best either, and
-/// the method's numbers are marked. The random policy is left out, because it has learned nothing.
+/// the method's numbers are marked. Policies that learn nothing are left out.
 fn finding_sentence(rows: &[MethodMetrics<'_>]) -> Option<String> {
     // Ranks the methods by Extrapolation.
-    let learned: Vec<_> = rows.iter().filter(|row| !row.method.is_random()).collect();
+    let learned: Vec<_> = rows.iter().filter(|row| row.method.learns()).collect();
     let mean = |row: &MethodMetrics<'_>, metric| row.means.get(&metric).copied();
     let both = |row: &MethodMetrics<'_>| Some((mean(row, Metric::Default)?, mean(row, Metric::Extrapolation)?));
     let mut ranked: Vec<_> =

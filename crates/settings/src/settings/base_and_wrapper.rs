@@ -38,6 +38,8 @@ pub enum Base {
     Ppo(PpoConfig),
     /// No learning: a random policy whose actions are all equally likely. It serves as a baseline.
     Random,
+    /// No learning: a policy with a rule that was written by hand for the environment. It serves as a baseline.
+    Heuristic,
 }
 
 /// A wrapper, which changes the episodes that a base algorithm learns from, with its settings.
@@ -55,7 +57,7 @@ pub enum Wrapper {
 /// The way in which a training collects rollouts. Trainings whose environments share a batch must have the same mode.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum CollectionMode {
-    /// The training collects no rollouts, because a random policy learns nothing.
+    /// The training collects no rollouts, because the policy learns nothing.
     None,
     /// Rollouts have few steps. Several trainings share a session, so that one message carries the steps of all of
     /// them.
@@ -69,7 +71,7 @@ pub enum CollectionMode {
 
 impl Settings {
     /// Returns all algorithms with their default settings, in the order in which users see them.
-    pub fn all() -> [Self; 7] {
+    pub fn all() -> [Self; 8] {
         let (a2c, ppo) = (|| Base::A2c(A2cConfig::default()), || Base::Ppo(PpoConfig::default()));
         let epopt = || Wrapper::Epopt(EpoptConfig::default());
         let rl2 = || Wrapper::Rl2(Rl2Config::default());
@@ -81,19 +83,20 @@ impl Settings {
             (rl2(), a2c()),
             (rl2(), ppo()),
             (Wrapper::Plain, Base::Random),
+            (Wrapper::Plain, Base::Heuristic),
         ]
         .map(|(wrapper, base)| Self { base, wrapper })
     }
 
     /// Returns the names of all algorithms.
-    pub fn names() -> [&'static str; 7] {
+    pub fn names() -> [&'static str; 8] {
         Self::all().map(|settings| settings.name())
     }
 
     /// Returns how rollouts are collected if no noise is added to observations.
     pub(super) fn rollouts(&self) -> CollectionMode {
         let n_steps = match (&self.wrapper, &self.base) {
-            (_, Base::Random) => return CollectionMode::None,
+            (_, Base::Random | Base::Heuristic) => return CollectionMode::None,
             (Wrapper::Epopt(_), _) => return CollectionMode::Long,
             (_, Base::A2c(a2c)) => a2c.n_steps,
             (_, Base::Ppo(ppo)) => ppo.n_steps,
@@ -105,6 +108,7 @@ impl Settings {
     pub fn name(&self) -> &'static str {
         match (&self.wrapper, &self.base) {
             (_, Base::Random) => "random",
+            (_, Base::Heuristic) => "heuristic",
             (Wrapper::Plain, Base::A2c(_)) => "a2c",
             (Wrapper::Plain, Base::Ppo(_)) => "ppo",
             (Wrapper::Epopt(_), Base::A2c(_)) => "epopt-a2c",
@@ -114,9 +118,14 @@ impl Settings {
         }
     }
 
-    /// Returns whether the policy is random and learns nothing.
+    /// Returns whether the policy acts at random.
     pub fn is_random(&self) -> bool {
         matches!(self.base, Base::Random)
+    }
+
+    /// Returns whether the policy learns. Otherwise it is made without a training.
+    pub fn learns(&self) -> bool {
+        !matches!(self.base, Base::Random | Base::Heuristic)
     }
 
     /// Returns whether the policy learns over trials of several episodes (RL²).
@@ -149,6 +158,7 @@ impl Settings {
                 Base::A2c(_) => Base::A2c(table().try_into()?),
                 Base::Ppo(_) => Base::Ppo(table().try_into()?),
                 Base::Random => Base::Random,
+                Base::Heuristic => Base::Heuristic,
             },
             wrapper: match self.wrapper {
                 Wrapper::Plain => Wrapper::Plain,
@@ -158,12 +168,12 @@ impl Settings {
         })
     }
 
-    /// Returns the discount factor γ per step; 1 for a random policy.
+    /// Returns the discount factor γ per step; 1 for a policy that does not learn.
     pub fn gamma(&self) -> f64 {
         match &self.base {
             Base::A2c(settings) => settings.gamma,
             Base::Ppo(settings) => settings.gamma,
-            Base::Random => 1.0,
+            Base::Random | Base::Heuristic => 1.0,
         }
     }
 
@@ -187,8 +197,8 @@ impl Settings {
                 check_size(settings.n_steps, num_envs)?;
                 check_minibatches(settings, architecture, num_envs)?;
             }
-            Base::Random => {
-                let expected = "\"ff\": a random policy has nothing to remember";
+            Base::Random | Base::Heuristic => {
+                let expected = format!("\"ff\": a {} policy has nothing to remember", self.name());
                 require(architecture == Architecture::Ff, "architecture", architecture, expected)?;
             }
         }

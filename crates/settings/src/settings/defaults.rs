@@ -11,7 +11,7 @@ pub(super) fn defaults_for(mut settings: Settings, architecture: Architecture, p
     tune(&mut settings, architecture);
     let num_envs = match (&settings.wrapper, &settings.base, architecture) {
         (Wrapper::Epopt(_), _, _) => 25,
-        (_, Base::Random, _) => 1,
+        (_, Base::Random | Base::Heuristic, _) => 1,
         (_, Base::Ppo(_), Architecture::Ff) => 8,
         _ => 16,
     };
@@ -19,7 +19,7 @@ pub(super) fn defaults_for(mut settings: Settings, architecture: Architecture, p
         (Wrapper::Plain | Wrapper::Rl2(_), Base::A2c(_)) => 100,
         _ => 1,
     };
-    let learns = !settings.is_random();
+    let learns = settings.learns();
     let common = Common {
         preset: Preset::Perturb,
         environment: String::new(),
@@ -66,6 +66,6 @@ fn tune(settings: &mut Settings, architecture: Architecture) {
                 ppo.n_epochs = 4; // an epoch takes five times as long as with a feed-forward policy
             }
         }
-        Base::Random => {}
+        Base::Random | Base::Heuristic => {}
     }
 }

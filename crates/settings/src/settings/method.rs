@@ -29,22 +29,22 @@ pub struct Method {
 }
 
 impl Method {
-    /// Returns whether the method is the random policy.
-    pub fn is_random(&self) -> bool {
-        self.algorithm == "random" && !self.external
+    /// Returns whether the method learns, unlike the random policy and the heuristic policies.
+    pub fn learns(&self) -> bool {
+        self.external || !matches!(self.algorithm.as_str(), "random" | "heuristic")
     }
 
     /// Returns whether the method only serves as a reference: it learns nothing, or its policies observe parameters
     /// that the policies of other methods have to infer.
     pub fn is_reference(&self) -> bool {
-        self.is_random() || self.observe.sees_parameters()
+        !self.learns() || self.observe.sees_parameters()
     }
 }
 
 impl fmt::Display for Method {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        if self.is_random() {
-            f.write_str("random policy (reference)")?;
+        if !self.learns() {
+            write!(f, "{} policy (reference)", self.algorithm)?;
         } else if self.external {
             f.write_str(&self.algorithm)?;
         } else {

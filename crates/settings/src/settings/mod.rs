@@ -367,7 +367,7 @@ fn defaults_of(config: &TrainConfig) -> Table {
     defaults.insert(PARAMETERS.into(), Value::Table(Table::new()));
     defaults.insert(CONTEXTS.into(), Value::Array(Vec::new()));
     defaults.insert("stop_at_success".into(), 0.0.into());
-    if !config.settings.is_random() {
+    if config.settings.learns() {
         defaults.insert("observation_noise".into(), 0.0.into());
         defaults.insert("weight_decay".into(), 0.0.into());
     }

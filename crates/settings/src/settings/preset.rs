@@ -52,7 +52,7 @@ pub(super) fn apply_paper(TrainConfig { common, settings }: &mut TrainConfig) {
             // steps. Nothing else depends on this setting.
             common.log_interval = if let Wrapper::Epopt(_) = settings.wrapper { 1 } else { 10 };
         }
-        Base::Random => {}
+        Base::Random | Base::Heuristic => {}
     }
     if let Wrapper::Epopt(epopt) = &mut settings.wrapper {
         epopt.rank_by = Ranking::Normalized;

@@ -16,7 +16,7 @@ fn refusal(file: Option<&str>, sets: &[&str]) -> String {
 fn ppo(config: &TrainConfig) -> &PpoConfig {
     match &config.settings.base {
         Base::Ppo(settings) => settings,
-        Base::A2c(_) | Base::Random => panic!("not PPO"),
+        Base::A2c(_) | Base::Random | Base::Heuristic => panic!("not PPO"),
     }
 }
 
@@ -317,7 +317,7 @@ fn contexts_are_written_and_list_the_same_parameters() {
 fn pairs() -> impl Iterator<Item = (&'static str, Architecture)> {
     let all = Settings::names().into_iter().flat_map(|name| Architecture::ALL.map(|architecture| (name, architecture)));
     all.filter(|(name, architecture)| {
-        *name != "random" && (!name.starts_with("rl2") || *architecture == Architecture::Rc)
+        !["random", "heuristic"].contains(name) && (!name.starts_with("rl2") || *architecture == Architecture::Rc)
     })
 }
 
@@ -333,22 +333,28 @@ fn ten_pairs_of_algorithm_and_architecture_are_valid() {
 }
 
 #[test]
-fn a_random_policy_has_no_settings_of_a_learner_and_no_memory() {
-    for preset in Preset::ALL {
-        let config = of(&preset.to_string(), "random", Architecture::Ff, &["episodes=7"]);
-        assert!(
-            config.settings.is_random() && !config.common.normalize_observations && !config.common.normalize_rewards
-        );
-        assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+fn policies_that_do_not_learn_have_no_learner_and_no_memory() {
+    for algorithm in ["random", "heuristic"] {
+        for preset in Preset::ALL {
+            let config = of(&preset.to_string(), algorithm, Architecture::Ff, &["episodes=7"]);
+            assert!(
+                !config.settings.learns() && !config.common.normalize_observations && !config.common.normalize_rewards
+            );
+            assert_eq!(load(Some(&config.to_toml()), &[], "").unwrap(), config);
+        }
+        let algorithm_key = format!("algorithm={algorithm}");
+        assert!(refusal(None, &[&algorithm_key, "learning_rate=1"]).contains("unknown key `learning_rate`"));
+        let message = refusal(None, &[&algorithm_key, "architecture=rc"]);
+        assert!(message.contains(&format!("a {algorithm} policy has nothing to remember")), "{message}");
     }
-    assert!(refusal(None, &["algorithm=random", "learning_rate=1"]).contains("unknown key `learning_rate`"));
-    let message = refusal(None, &["algorithm=random", "architecture=rc"]);
-    assert!(message.contains("a random policy has nothing to remember"), "{message}");
 }
 
 #[test]
 fn names_are_typed_as_they_are_written() {
-    assert_eq!(Settings::names(), ["a2c", "ppo", "epopt-a2c", "epopt-ppo", "rl2-a2c", "rl2-ppo", "random"]);
+    assert_eq!(
+        Settings::names(),
+        ["a2c", "ppo", "epopt-a2c", "epopt-ppo", "rl2-a2c", "rl2-ppo", "random", "heuristic"]
+    );
     assert_eq!(serde_json::to_value(Architecture::ALL).unwrap(), serde_json::json!(Architecture::NAMES));
 }
 

@@ -1,8 +1,11 @@
-//! Makes the random policy: a checkpoint that can be tested like any other, but needs no training.
+//! Makes the policies that learn nothing: checkpoints that can be tested like any other, but need no training.
 //!
-//! The policy acts like Gymnasium's `action_space.sample()` and ignores observations: discrete actions are equally
-//! likely, and continuous actions are uniform within their bounds. The weights encode this: weights of observations are
-//! 0, biases are the middles of the bounds, and `log_std` is the logarithm of half the distance between the bounds.
+//! The rules of heuristic policies are in [`heuristic`].
+//!
+//! The random policy acts like Gymnasium's `action_space.sample()` and ignores observations: discrete actions are
+//! equally likely, and continuous actions are uniform within their bounds. The weights encode this: weights of
+//! observations are 0, biases are the middles of the bounds, and `log_std` is the logarithm of half the distance between
+//! the bounds.
 
 use perturb_checkpoint::Counters;
 use perturb_files::write_atomically;
@@ -10,16 +13,17 @@ use perturb_policy::math::ln;
 use perturb_policy::{NamedArray, PolicySpec, RewardNormaliser, Weights};
 use perturb_settings::{Common, TrainConfig};
 
-use super::{Result, TrainError, TrainOutcome, TrainRequest};
+use super::{Result, TrainError, TrainOutcome, TrainRequest, heuristic};
 use crate::checkpoint::{Checkpoint, EnvironmentSummary, State};
 use crate::client::Servers;
 use crate::logging::Progress;
 use crate::proto::{Channel, Environment, action_space::Kind};
 
-/// Writes the random policy to the directory of `entry`: as the last checkpoint, and as the policy of every mark.
+/// Writes the policy to the directory of `entry`: as the last checkpoint, and as the policy of every mark.
 ///
 /// # Errors
-/// An error if the server does not know the environment, if actions have no bounds, or if files cannot be written.
+/// An error if the server does not know the environment, if the environment has no heuristic policy, if random actions
+/// have no bounds, or if files cannot be written.
 pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainOutcome> {
     let TrainRequest { directory, ref start, marks } = *entry;
     let config = start.config();
@@ -32,8 +36,8 @@ pub(super) fn make(servers: &Servers, entry: &TrainRequest<'_>) -> Result<TrainO
     Ok(TrainOutcome { checkpoint, progress: Progress::default(), signal: None })
 }
 
-/// Returns the checkpoint of the random policy in `environment`.
-fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
+/// Returns the checkpoint of the policy in `environment`.
+pub(super) fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpoint> {
     let Common { normalize_rewards, num_envs, reward_return_runs_on, .. } = config.common;
     let summary = EnvironmentSummary::from_environment(environment).ok_or(TrainError::NoActions)?;
     let rewards = normalize_rewards
@@ -48,12 +52,16 @@ fn checkpoint(config: &TrainConfig, environment: &Environment) -> Result<Checkpo
     };
     state.observation_normaliser = state.fresh_normaliser();
     let policy = state.policy();
-    let weights = weights(&policy, environment)?;
+    let weights = if config.settings.is_random() {
+        random(&policy, environment)?
+    } else {
+        heuristic::weights(&policy, environment)?
+    };
     Ok(Checkpoint { state, policy, weights })
 }
 
 /// Returns the weights of the random policy. Returns an error if an action has no finite bounds.
-fn weights(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
+fn random(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
     let channels: &[Channel] = match environment.action.as_ref().and_then(|action| action.kind.as_ref()) {
         Some(Kind::Continuous(continuous)) => &continuous.channels,
         _ => &[],
