@@ -74,25 +74,6 @@ def paper_best(studies, environment):
     return [best("default"), best("interpolation"), None, best("extrapolation")]
 
 
-def trained_on_both(studies):
-    """Return a row for each method of the study references, with empty fields as long as the study has no results."""
-    lines = []
-    for algorithm in ("ppo", "a2c"):
-        for observe, ending in (("parameters", ", sees the parameters"), ("state", "")):
-            fields = []
-            for environment in ENVIRONMENTS:
-                wanted = {"environment": environment, "algorithm": algorithm}
-                cells = [
-                    cell
-                    for cell in studies.finished("references", **wanted)
-                    if cell.settings.get("observe", "state") == observe
-                ]
-                rates = [fixed(fmean(cell.success(version) for cell in cells)) for version in "DRE"] if cells else "–"
-                fields.append(" / ".join(rates))
-            lines.append(f"| {algorithm.upper()}{ending} | " + " | ".join(fields) + " |")
-    return lines
-
-
 def reference_lines(studies):
     """Return the texts with numbers that docs/findings/reference-lines.md must contain."""
     known = bounds()
@@ -112,7 +93,7 @@ def reference_lines(studies):
         texts.append(f"| {environment} | | | | |")
         texts += [line(name, rates) for name, rates in shown.items()]
         rows[environment] = shown
-    return [*texts, *answer(rows), *mountain_car(studies, rows["MountainCar"], known), *trained_on_both(studies)]
+    return [*texts, *answer(rows), *mountain_car(studies, rows["MountainCar"], known)]
 
 
 def answer(rows):

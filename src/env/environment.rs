@@ -152,7 +152,7 @@ pub fn resolve<'a>(
     let result = base.iter().zip(replaced.iter().cycle()).map(|(old, new)| new.as_ref().unwrap_or(old));
     let bytes = distributions_bytes(result);
     if bytes > MAX_DISTRIBUTIONS_BYTES {
-        return Err(Error::TooManyDistributions { environment: spec.name, bytes, most: MAX_DISTRIBUTIONS_BYTES });
+        return Err(Error::TooManyDistributions { environment: spec.name, bytes, limit: MAX_DISTRIBUTIONS_BYTES });
     }
     for (old, new) in base.iter_mut().zip(replaced.iter().cycle()) {
         if let Some(new) = new {

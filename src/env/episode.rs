@@ -26,6 +26,9 @@ pub struct EpisodeSettings {
     pub episodes_per_trial: u32,
 }
 
+/// Number of boxes that every environment accepts in a snapshot. Version R+E has two.
+const MIN_RESTORED_BOXES: usize = 2;
+
 /// Maximal number of boxes in [`EpisodeSettings::distributions`]. Version R+E has two for each context.
 const MAX_BOXES: usize = 2 * MAX_DRAWN_CONTEXTS;
 
@@ -123,6 +126,8 @@ pub struct Episodes {
     pub(super) progress: EpisodeProgress,
     /// The parameters at the end of each observation; `None` if observations do not include them.
     pub(super) observed_parameters: Option<Box<ObservedParameters>>,
+    /// The maximum number of boxes in a restored snapshot. It limits the memory of the environment.
+    pub(super) max_boxes: usize,
 }
 
 /// Returns the number of boxes of the parameter space that a list of `distributions` distributions describes. Each box
@@ -140,13 +145,16 @@ impl Episodes {
     /// If `settings` does not have one distribution for each parameter in each box.
     pub fn new(environment: Box<dyn Environment>, settings: EpisodeSettings) -> Self {
         let n = environment.spec().parameters.len();
-        assert!(
-            boxes(settings.distributions.len(), n).is_some(),
-            "settings.distributions has one distribution for each parameter in each box"
-        );
-        let values = vec![0.0; n];
-        let mut episodes =
-            Self { environment, settings, values, progress: EpisodeProgress::default(), observed_parameters: None };
+        let boxes = boxes(settings.distributions.len(), n)
+            .expect("settings.distributions has one distribution for each parameter in each box");
+        let mut episodes = Self {
+            environment,
+            settings,
+            values: vec![0.0; n],
+            progress: EpisodeProgress::default(),
+            observed_parameters: None,
+            max_boxes: boxes.max(MIN_RESTORED_BOXES),
+        };
         episodes.start(None);
         episodes
     }

@@ -81,7 +81,7 @@ pub enum Error {
     },
     /// The distributions of all contexts take more memory than one environment may have.
     #[error(
-        "the distributions of {environment} take {bytes} bytes; give fewer contexts or intervals, at most {most} bytes"
+        "the distributions of {environment} take {bytes} bytes; give fewer contexts or intervals, at most {limit} bytes"
     )]
     TooManyDistributions {
         /// The environment's name.
@@ -89,7 +89,7 @@ pub enum Error {
         /// The size of the distributions in a snapshot, in bytes.
         bytes: usize,
         /// The accepted maximum.
-        most: usize,
+        limit: usize,
     },
     /// A snapshot cannot be restored.
     #[error("the snapshot cannot be restored: {reason}; take a new one from a session of the same environment")]

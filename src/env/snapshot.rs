@@ -135,6 +135,15 @@ impl Episodes {
         if saved.model_hash != self.environment.model_hash() {
             return Err(Error::Snapshot { reason: "it was taken with another model".into() });
         }
+        let found = boxes(distributions.len(), saved.values.len()).unwrap_or_default();
+        if found > self.max_boxes {
+            let reason = format!(
+                "its parameters are drawn from a list of {found}, this session accepts at most {}; open the session with \
+                 the same contexts",
+                self.max_boxes
+            );
+            return Err(Error::Snapshot { reason });
+        }
         Ok((saved, distributions))
     }
 }
@@ -212,6 +221,12 @@ impl Saved {
             return refuse(format!("it does not have the {n} parameters of {}", spec.name));
         }
         let distributions = Self::distributions(spec, &saved)?;
+        let bytes = distributions_bytes(&distributions);
+        if bytes > MAX_DISTRIBUTIONS_BYTES {
+            return refuse(format!(
+                "its distributions have {bytes} bytes, but at most {MAX_DISTRIBUTIONS_BYTES} are possible"
+            ));
+        }
         let EpisodeProgress { trial, episode, episode_in_trial, length, total_reward, ended, .. } = saved.progress;
         let EpisodeProgress { reached_at, held_for, held_longest, .. } = saved.progress;
         if episode_in_trial >= saved.episodes_per_trial

@@ -79,6 +79,8 @@ pub struct Batch {
     drop_hook: Option<DropHook>,
     /// Whether environments may have noise, whose random numbers can be drawn ahead.
     has_noise: bool,
+    /// Whether the last request was a step that ran on the session's thread.
+    stepped_inline: bool,
     /// A sender that is dropped when the environments have been freed, for which [`Batch::close`] waits. It must be the
     /// last field, because fields are dropped in order.
     freed: Option<oneshot::Sender<()>>,
@@ -105,7 +107,8 @@ impl Batch {
         let shard = |(i, part)| Mutex::new(Shard::new(&settings, part, i * shard_size));
         let shards = parts.map(shard).collect();
         let job = job(&settings, shards, pool.workers(), owned, size);
-        let has_noise = disturbance::has_noise(settings.spec);
+        let is_noisy = |group: &SlotGroupSettings| disturbance::has_noise(settings.spec, &group.episodes.distributions);
+        let has_noise = settings.groups.iter().any(is_noisy);
         let mut batch = Self {
             settings,
             size,
@@ -120,6 +123,7 @@ impl Batch {
             runner: None,
             drop_hook: None,
             has_noise,
+            stepped_inline: false,
             freed: None,
         };
         batch.run().await?;
@@ -161,6 +165,7 @@ impl Batch {
                 self.runner = None;
                 set_actions(&self.job.shards, actions);
                 if self.workers.step_inline(&self.job) {
+                    self.stepped_inline = true;
                     self.job.result()?;
                     return Ok(self.step_result(start, Instant::now()));
                 }
@@ -187,9 +192,10 @@ impl Batch {
         }
     }
 
-    /// Whether [`Batch::draw_ahead`] can make the next step faster. It cannot if the workers run the steps.
+    /// Whether [`Batch::draw_ahead`] can make the next step faster. If the workers ran the last step, drawing ahead on
+    /// this thread would only delay other sessions.
     pub fn draws_ahead(&self) -> bool {
-        self.has_noise && !self.is_running && !self.job.needs_workers()
+        self.has_noise && self.stepped_inline
     }
 
     /// Draws the random numbers of the next step's noise on the calling thread. Call this method while the session waits
@@ -405,6 +411,7 @@ impl Batch {
     /// Prepares for a request other than a pipelined step: waits until no request is running, and checks that none has
     /// failed.
     async fn ready(&mut self) -> Result<(), Error> {
+        self.stepped_inline = false;
         self.finish_abandoned().await;
         self.job.result()
     }

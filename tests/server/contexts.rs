@@ -1,10 +1,11 @@
 //! Contexts: each trial has the parameters of one row of a list.
 
 use crate::common::server::{Actor, Server, Session, contexts, open, parameters, refusal};
+use bytes::Bytes;
 use insta::assert_snapshot;
 use perturb::{
     env::{DrawPurpose, EnvironmentSpec, PhiloxStream, Version},
-    proto::{self, AutoresetMode, EpisodeStart, Open, Release, Reset, SlotGroup},
+    proto::{self, AutoresetMode, EpisodeStart, Open, Release, Reset, Restore, SlotGroup},
     tasks,
 };
 
@@ -129,15 +130,20 @@ async fn group_with_contexts_is_a_session_of_its_own() {
 }
 
 #[tokio::test]
-async fn contexts_are_restored_into_any_session() {
+async fn contexts_are_restored_into_sessions_with_as_many() {
     let server = Server::start(&[]);
     let mut whole = Part::open(&server, with(rows(), 3)).await;
     whole.play(0, STEPS).await;
     let snapshots = whole.session.snapshot(&[]).await;
     let expected = whole.play(STEPS, 2 * STEPS).await;
-    let mut other = Part::open(&server, Open { contexts: None, seed: 9, ..with(rows(), 3) }).await;
+    let others = contexts(&["length"], &[0.4, 0.5, 0.6, 0.7]);
+    let mut other = Part::open(&server, Open { seed: 9, ..with(others, 3) }).await;
     other.session.restore(&[], snapshots.clone()).await;
     assert!(other.play(STEPS, 2 * STEPS).await == expected);
+    // The lists of forged snapshots would take memory that a session without contexts did not reserve.
+    let mut without = Part::open(&server, Open { contexts: None, ..with(rows(), 3) }).await;
+    let (_, refused) = without.session.refused(Restore { mask: Bytes::new(), snapshots: snapshots.clone() }).await;
+    assert!(refused.contains("a list of 4, this session accepts at most 2"), "{refused}");
     // The first session restores them, too, and frees an environment.
     whole.session.restore(&[], snapshots).await;
     whole.session.ask(Release { mask: vec![1, 0, 0].into() }).await;

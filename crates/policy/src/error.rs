@@ -56,8 +56,8 @@ pub enum Error {
     NoSamples,
     /// The operating system could not start the threads.
     #[error(
-        "{wanted} more threads cannot be started: {reason}; use fewer threads, or raise the limit of processes and threads \
-         (`ulimit -u`, in a container pids.max)"
+        "{wanted} more threads cannot be started: {reason}; use fewer threads, or raise the limit of processes and \
+         threads (`ulimit -u`, in a container pids.max)"
     )]
     Threads {
         /// Number of threads that were requested.

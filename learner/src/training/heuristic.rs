@@ -13,7 +13,7 @@
 
 use std::f32::consts::FRAC_PI_6;
 
-use perturb_policy::{NamedArray, PolicySpec, Weights};
+use perturb_policy::{ActionKind, NamedArray, PolicySpec, Weights};
 
 use super::{Result, TrainError};
 use crate::proto::Environment;
@@ -40,6 +40,11 @@ pub(super) fn weights(policy: &PolicySpec, environment: &Environment) -> Result<
         "Pendulum" => PENDULUM,
         name => return Err(TrainError::NoHeuristic { environment: name.into() }),
     };
+    // A server may have another environment of this name.
+    let (ActionKind::Discrete { n: outputs } | ActionKind::Continuous { size: outputs }) = policy.action;
+    if outputs != layers[2].len() || layers[0].iter().any(|(weights, _)| weights.len() > policy.observation_size) {
+        return Err(TrainError::NoHeuristic { environment: environment.name.clone() });
+    }
     let array = |(name, shape): (String, Vec<usize>)| {
         let mut data = vec![0.0; shape.iter().product()];
         if name == "log_std" {

@@ -17,7 +17,7 @@ mod noise;
 mod parameters;
 mod sensors;
 
-use super::{Environment, EnvironmentSpec, Error, ParameterSpec, QuantitySpec, shorten};
+use super::{Distribution, Environment, EnvironmentSpec, Error, ParameterSpec, QuantitySpec, shorten};
 use layer::Disturbed;
 use parameters::DisturbanceSet;
 use std::sync::{Mutex, OnceLock, PoisonError};
@@ -68,9 +68,13 @@ pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
     twins.iter().find(|twin| std::ptr::eq(twin.disturbed, spec)).map_or(spec, |twin| twin.base)
 }
 
-/// Whether the actions or observations of an environment may have noise.
-pub fn has_noise(spec: &EnvironmentSpec) -> bool {
-    spec.parameters.iter().any(|parameter| parameter.name == parameters::SENSOR_NOISE)
+/// Whether environments with these distributions have noisy actions or observations. `distributions` has the layout of
+/// [`EpisodeSettings::distributions`](super::EpisodeSettings::distributions).
+pub fn has_noise(spec: &EnvironmentSpec, distributions: &[Distribution]) -> bool {
+    let mut parameters = spec.parameters.iter().cycle().zip(distributions);
+    parameters.any(|(parameter, distribution)| {
+        parameters::NOISES.contains(&parameter.name) && distribution.fixed_value() != Some(0.0)
+    })
 }
 
 /// Returns the environment that has parameters with these names: the disturbed twin if one of the names is a

@@ -63,3 +63,21 @@ impl NoiseNumbers<'_> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_drawn_ahead_are_used_at_their_step_only() {
+        let draw = Draw { seed: 7, environment_index: 3, episode_index: 2 };
+        let mut noise = NoiseAhead::new(DrawPurpose::SensorNoise, 6);
+        let now = noise.at_step(&draw, 5).next::<4>();
+        noise.draw(&draw, 5);
+        let mut ahead = noise.at_step(&draw, 5);
+        assert!(matches!(ahead, NoiseNumbers::Ahead(_)));
+        assert_eq!(ahead.next::<4>(), now);
+        let others = [(Draw { episode_index: 3, ..draw }, 5), (draw, 6)];
+        assert!(others.iter().all(|(draw, step)| matches!(noise.at_step(draw, *step), NoiseNumbers::Now(_))));
+    }
+}

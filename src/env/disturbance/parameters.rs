@@ -22,8 +22,8 @@ const MAX_PUSH: f64 = 1000.0;
 const MAX_PUSH_INTERVAL: f64 = 1e6;
 /// Maximal number of steps before or between changes of the physics.
 const MAX_CHANGE_STEPS: f64 = 1e6;
-/// The name of the noise of observations. Every environment with disturbances has this parameter.
-pub(super) const SENSOR_NOISE: &str = "sensor_noise";
+/// The names of the noise of actions, and of the noise of observations.
+pub(super) const NOISES: [&str; 2] = ["action_noise", "sensor_noise"];
 /// The name of the scale of all actuators, and the prefix of the names of the scales of single actuators.
 const ACTION_SCALE: &str = "action_scale";
 
@@ -170,7 +170,7 @@ impl DisturbanceSet {
             ),
             (
                 DisturbanceKind::SensorNoise,
-                share(SENSOR_NOISE, "standard deviation of observations, as a share of their scales", MAX_FACTOR)
+                share("sensor_noise", "standard deviation of observations, as a share of their scales", MAX_FACTOR)
                     .off(0.0),
             ),
             (

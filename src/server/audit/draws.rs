@@ -216,7 +216,7 @@ impl DrawAuditor {
     ) -> Result<PendingDraws, Error> {
         let mut last: Option<&[Distribution]> = None;
         for (NextDraw { distributions, .. }, _) in begins.clone() {
-            if last.replace(distributions) != Some(distributions) {
+            if !last.replace(distributions).is_some_and(|last| is_same(last, distributions)) {
                 self.check(spec, distributions)?;
             }
         }
@@ -254,6 +254,11 @@ impl DrawAuditor {
     }
 }
 
+/// Whether two lists of distributions are equal. Environments mostly share a list, which is not compared then.
+fn is_same(one: &[Distribution], other: &[Distribution]) -> bool {
+    std::ptr::eq(one, other) || one == other
+}
+
 /// Groups successive environments that begin draws of the same seed, region and episode. Returns the regions and the
 /// groups. A group refers to its region by index.
 fn group_begins<'a>(
@@ -263,7 +268,7 @@ fn group_begins<'a>(
     let mut last: Option<&[Distribution]> = None;
     let (mut regions, mut group_begins): (Vec<Region>, Vec<DrawStart>) = (Vec::new(), Vec::new());
     for (NextDraw { draw, distributions }, count) in begins {
-        if last.replace(distributions) != Some(distributions) {
+        if !last.replace(distributions).is_some_and(|last| is_same(last, distributions)) {
             regions.push(spec.region(distributions));
         }
         let Draw { seed, environment_index: index, episode_index: episode } = draw;

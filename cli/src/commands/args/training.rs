@@ -91,8 +91,8 @@ pub struct TrainArgs {
         long,
         value_name = "DIR",
         conflicts_with_all = [
-            "env", "version", "parameters", "contexts", "preset", "algorithm", "architecture", "observe", "episodes_per_trial",
-            "episodes", "seed", "out", "overwrite", "config", "set"
+            "env", "version", "parameters", "contexts", "preset", "algorithm", "architecture", "observe",
+            "episodes_per_trial", "episodes", "seed", "out", "overwrite", "config", "set"
         ]
     )]
     pub resume: Option<PathBuf>,

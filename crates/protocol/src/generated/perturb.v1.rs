@@ -435,7 +435,8 @@ pub struct Contexts {
     pub names: ::prost::alloc::vec::Vec<::prost::alloc::string::String>,
     /// The values \[contexts, names\], for 1 … 1024 contexts. The distributions of one environment may take at most 216 KiB:
     /// each parameter takes 1 byte and 16 bytes for each interval, in each context. In version R+E they take twice as
-    /// much. So there is always room for 1024 contexts of 12 parameters with fixed values.
+    /// much. So 1024 contexts of 12 parameters with fixed values fit, in version R+E 1024 contexts of 6. If a disturbance
+    /// is named, all disturbances count as parameters.
     #[prost(double, repeated, tag = "2")]
     pub values: ::prost::alloc::vec::Vec<f64>,
 }

@@ -248,7 +248,7 @@ pub fn reset(batch: &Batch, request: proto::Reset) -> Result<Vec<ResetEntry>, Er
         let mut distributions = None;
         if !request.parameters.is_empty() {
             let old = batch.distributions(slot);
-            if old != edited[0] {
+            if !Arc::ptr_eq(&old, &edited[0]) && old != edited[0] {
                 let mut new = old.to_vec();
                 override_parameters(spec, &mut new, &request.parameters)?;
                 edited = [old, new.into()];

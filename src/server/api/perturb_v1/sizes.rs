@@ -3,7 +3,7 @@
 
 use crate::{
     env::{self, ActionSpec},
-    pool::{Autoreset, Batch, BatchSettings, RolloutRequest},
+    pool::{self, Autoreset, Batch, BatchSettings, RolloutRequest},
     proto,
     render::Size,
 };
@@ -57,14 +57,16 @@ pub fn step_request(settings: &BatchSettings, envs: usize) -> usize {
     envs.saturating_mul(4 * action_width(settings))
 }
 
-/// Returns the memory that a session reserves when it is opened, bytes: the distributions of all groups, two step
-/// requests, and three replies (one being computed, one waiting, one being sent). With this reservation, no step is refused because of the memory that other
-/// sessions use.
+/// Returns the memory that a session reserves when it is opened, bytes: the distributions of all environments, two step
+/// requests, and three replies (one being computed, one waiting, one being sent). With this reservation, no step is
+/// refused because of the memory that other sessions use.
 pub fn session(settings: &BatchSettings, envs: usize) -> usize {
     let numbers = 2 * settings.observation_size() + 1 + settings.spec.reward_terms.len();
     let ends = if settings.receipts { 2 * receipt_bytes(settings) } else { EPISODE_END_BYTES };
     let reply = envs.saturating_mul(4 * numbers + 2 + ends);
-    let distributions: usize = settings.groups.iter().map(|group| group.episodes.distributions.len()).sum();
+    // Environments of a group share their distributions at first. After resets and restores each may have its own.
+    let of_group = |group: &pool::SlotGroupSettings| group.size.saturating_mul(group.episodes.distributions.len());
+    let distributions = settings.groups.iter().map(of_group).fold(0, usize::saturating_add);
     let fixed = distributions.saturating_mul(DISTRIBUTION_BYTES);
     fixed.saturating_add(step_request(settings, envs).saturating_mul(2)).saturating_add(reply.saturating_mul(3))
 }
