@@ -12,6 +12,7 @@ import tempfile
 from pathlib import Path
 
 import perturb
+import results_changes
 import results_given
 import results_lines
 import results_pages
@@ -27,6 +28,7 @@ PAGES = {
     "README.md": results_pages.readme,
     "results/README.md": results_pages.results,
     "docs/findings/classic-ff.md": results_pages.classic_ff,
+    "docs/findings/changing-physics.md": results_changes.changing_physics,
     "docs/findings/acrobot-steps.md": results_pages.acrobot,
     "docs/findings/beyond.md": results_pages.beyond,
     "docs/findings/cart-pole-ties.md": results_pages.cart_pole,

@@ -77,6 +77,15 @@ GIVEN = {
         # From a repeated training whose policy is not stored.
         r"42\.1 % on D, the other of 0\.0 %",
     ],
+    "docs/findings/changing-physics.md": [
+        # From the experiment file.
+        r"after 100 of at most 200 steps",
+        r"change after (?:100|50) steps",
+        r"last 100 episodes",
+        r"three seeds \(2 to 4\) and 1 000 episodes in each test",
+        r"95 % Wilson intervals over the 3 000 episodes",
+        r"after 100 and 50 steps",
+    ],
     "docs/findings/reference-lines.md": [
         # From the plan, and from the binomial distribution.
         r"1 000 on each of D, R and E with each of the seeds 7 to 11",

@@ -3,11 +3,14 @@
 use super::{
     Action, ActionSpec, ChannelSpec, Distribution, Draw, Error, Interval, ParameterSpec, PhiloxStream, QuantitySpec,
     RewardTermSpec, SuccessRuleSpec, Version, shorten,
-    snapshot::{MAX_DISTRIBUTIONS_BYTES, distributions_bytes},
 };
 use crate::scene::Scene;
-use perturb_protocol::region::Region;
+use perturb_protocol::{limits::MAX_INTERVALS, region::Region};
 use std::fmt;
+
+/// Maximal size of distributions in a snapshot, in bytes: the distributions of R and of E for 32 parameters and 76
+/// disturbances, of 64 intervals each. As many bytes hold 1024 contexts of 12 fixed parameters.
+pub(super) const MAX_DISTRIBUTIONS_BYTES: usize = 2 * (32 + 76) * (1 + MAX_INTERVALS * size_of::<(f64, f64)>());
 
 /// A function that creates an environment with default parameters.
 pub type MakeEnvironment = dyn Fn() -> Result<Box<dyn Environment>, Error> + Send + Sync;
@@ -86,6 +89,12 @@ impl EnvironmentSpec {
         let boxes = distributions.chunks(self.parameters.len().max(1));
         Region::new(boxes.map(|each| names().zip(each.iter().cloned()).collect()).collect())
     }
+}
+
+/// Returns the size of distributions in a snapshot, in bytes, without the number of distributions that precedes them.
+pub(crate) fn distributions_bytes<'a>(distributions: impl IntoIterator<Item = &'a Distribution>) -> usize {
+    // The number of a distribution's intervals is at most 64, so its encoding takes one byte.
+    distributions.into_iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
 /// Checks that the interval from `low` to `high` is within the parameter's physical range.

@@ -14,6 +14,7 @@ mod spaces;
 mod success;
 
 pub use catalogue::Catalogue;
+pub(crate) use environment::distributions_bytes;
 pub use environment::{
     Environment, EnvironmentSpec, MakeEnvironment, PushSpec, Transition, check_bounds, check_distribution, resolve,
 };
@@ -23,7 +24,7 @@ pub(crate) use error::shorten;
 pub use parameter::ParameterSpec;
 pub use perturb_protocol::{Distribution, DistributionError, Interval, Version};
 pub use seeding::{Draw, DrawPurpose, PhiloxStream};
-pub(crate) use snapshot::{MAX_SNAPSHOT_BYTES, distributions_bytes};
+pub(crate) use snapshot::MAX_SNAPSHOT_BYTES;
 pub use snapshot::{SavedDraw, saved_draw};
 pub use spaces::{Action, ActionSpec, ChannelSpec, QuantitySpec, RewardTermSpec};
 pub use success::{Achievement, SuccessComparison, SuccessRuleSpec};

@@ -2,10 +2,10 @@
 
 use super::{
     Distribution, Draw, EnvironmentSpec, EpisodeSettings, Episodes, Error, Interval, check_bounds, check_distribution,
+    environment::{MAX_DISTRIBUTIONS_BYTES, distributions_bytes},
     episode::{EpisodeProgress, boxes},
     shorten,
 };
-use perturb_protocol::limits::MAX_INTERVALS;
 use serde::{Deserialize, Serialize};
 use std::sync::Arc;
 
@@ -16,10 +16,6 @@ const FORMAT: u32 = 3;
 const UNSEALED: u32 = 2;
 /// The first format, which has only [`Saved`]. Later formats append [`EpisodeProgress::held_longest`].
 const FIRST: u32 = 1;
-
-/// Maximal size of distributions in a snapshot, in bytes: the distributions of R and of E for 32 parameters and 76
-/// disturbances, of 64 intervals each. As many bytes hold 1024 contexts of 12 fixed parameters.
-pub(super) const MAX_DISTRIBUTIONS_BYTES: usize = 2 * (32 + 76) * (1 + MAX_INTERVALS * size_of::<(f64, f64)>());
 
 /// Maximal size of a snapshot, in bytes. The largest possible snapshot consists of:
 ///
@@ -146,12 +142,6 @@ impl Episodes {
         }
         Ok((saved, distributions))
     }
-}
-
-/// Returns the size of distributions in a snapshot, in bytes, without the number of distributions that precedes them.
-pub(crate) fn distributions_bytes<'a>(distributions: impl IntoIterator<Item = &'a Distribution>) -> usize {
-    // The number of a distribution's intervals is at most 64, so its encoding takes one byte.
-    distributions.into_iter().map(|distribution| 1 + size_of::<(f64, f64)>() * distribution.intervals().len()).sum()
 }
 
 /// The seed, parameter distributions and current parameters of the environment in a snapshot. The server's ledger uses

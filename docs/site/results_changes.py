@@ -1,0 +1,36 @@
+"""The numbers of docs/findings/changing-physics.md, from the results table."""
+
+import math
+
+from results_words import fixed, spread
+
+METHODS = {"PPO FF": ("ppo", "ff"), "PPO RC": ("ppo", "rc"), "RL²-PPO RC": ("rl2-ppo", "rc")}
+TESTS = ("R", "changing", "earlier")
+SEEDS = 3
+Z = 1.959963984540054  # of a 95 % interval
+
+
+def wilson(percent, n):
+    """Return the 95 % Wilson interval of a success rate in `n` episodes, %."""
+    rate = percent / 100
+    middle, width = rate + Z**2 / (2 * n), Z * math.sqrt(rate * (1 - rate) / n + Z**2 / (4 * n**2))
+    return [100 * (middle + sign * width) / (1 + Z**2 / n) for sign in (-1, 1)]
+
+
+def changing_physics(studies):
+    """Return the texts with numbers that the page must contain."""
+    texts = []
+    for task in ("CartPole", "Pendulum"):
+        for name, (algorithm, architecture) in METHODS.items():
+            wanted = {"environment": task, "algorithm": algorithm, "architecture": architecture}
+            cells = studies.finished("changes", trained_on="changing", **wanted)
+            assert len(cells) == SEEDS, f"the table has {len(cells)} cells of {name} on {task}"
+            fields = []
+            for test in TESTS:
+                rates = [cell.success(test) for cell in cells]
+                ends = wilson(sum(rates) / SEEDS, sum(cell.tests[test][2] for cell in cells))
+                fields.append(f"{spread(rates)} [{', '.join(map(fixed, ends))}]")
+            lengths = sorted(cell.episodes for cell in cells)
+            fields.append(f"{lengths[0]} to {lengths[-1]}")
+            texts.append(f"| {name} | " + " | ".join(fields) + " |")
+    return texts
