@@ -2,7 +2,7 @@
 
 import math
 
-from results_words import fixed, spread
+from results_words import fill, fixed, spread
 
 METHODS = {"PPO FF": ("ppo", "ff"), "PPO RC": ("ppo", "rc"), "RL²-PPO RC": ("rl2-ppo", "rc")}
 TESTS = ("R", "changing", "earlier")
@@ -19,7 +19,7 @@ def wilson(percent, n):
 
 def changing_physics(studies):
     """Return the texts with numbers that the page must contain."""
-    texts = []
+    texts, changed = [], {}
     for task in ("CartPole", "Pendulum"):
         for name, (algorithm, architecture) in METHODS.items():
             wanted = {"environment": task, "algorithm": algorithm, "architecture": architecture}
@@ -30,7 +30,14 @@ def changing_physics(studies):
                 rates = [cell.success(test) for cell in cells]
                 ends = wilson(sum(rates) / SEEDS, sum(cell.tests[test][2] for cell in cells))
                 fields.append(f"{spread(rates)} [{', '.join(map(fixed, ends))}]")
+                changed[task, name, test] = sum(rates) / SEEDS
             lengths = sorted(cell.episodes for cell in cells)
-            fields.append(f"{lengths[0]} to {lengths[-1]}")
+            fields.append(f"{lengths[0]:,} to {lengths[-1]:,}".replace(",", " "))
             texts.append(f"| {name} | " + " | ".join(fields) + " |")
-    return texts
+    rates = [rate for (_, _, test), rate in changed.items() if test != "R"]
+    gain = changed["Pendulum", "RL²-PPO RC", "changing"] - changed["Pendulum", "PPO FF", "changing"]
+    return [
+        *texts,
+        fill("{:.1f} to {:.1f} % of the episodes with a change succeed", min(rates), max(rates)),
+        fill("RL²-PPO is {:.1f} points better than PPO without memory", gain),
+    ]

@@ -80,7 +80,7 @@ GIVEN = {
     "docs/findings/changing-physics.md": [
         # From the experiment file.
         r"after 100 of at most 200 steps",
-        r"change after (?:100|50) steps",
+        r"changes? after (?:100|50) steps",
         r"last 100 episodes",
         r"three seeds \(2 to 4\) and 1 000 episodes in each test",
         r"95 % Wilson intervals over the 3 000 episodes",
