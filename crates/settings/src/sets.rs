@@ -1,5 +1,5 @@
-//! Parameter sets: the parameter values that a policy is trained or tested on. A set is one of an environment's versions D
-//! (deterministic), R (random), E (extreme) and R+E, possibly with other values for some parameters.
+//! Parameter sets: the parameter values that a policy is trained or tested on. A set is one of an environment's
+//! versions D (deterministic), R (random), E (extreme) and R+E, possibly with other values for some parameters.
 
 mod rows;
 

@@ -22,21 +22,25 @@ use crate::proto::Environment;
 type Unit<'a> = (&'a [f32], f32);
 
 /// Factor that saturates tanh: the output is ±1 unless the input is almost 0.
-const STEEP: f32 = 1e5;
+const SATURATION: f32 = 1e5;
 
-/// The highest logit of an action; that of each other action is lower by `SURE` or more. The probability of the other
-/// actions is thus at most e^-100, about 4e-44. `SURE` also saturates the units of Pendulum's second layer.
-const SURE: f32 = 100.0;
+/// The highest logit of an action. That of each other action is lower by `MAX_LOGIT` or more, so the probability of the
+/// other actions is at most e^-100, about 4e-44. `MAX_LOGIT` also saturates the units of Pendulum's second layer.
+const MAX_LOGIT: f32 = 100.0;
 
 /// Logarithm of the standard deviation of Pendulum's torque. The deviation is about 2e-9 N m.
-const EXACT: f32 = -20.0;
+const LOG_STD: f32 = -20.0;
 
 /// Returns the weights of the heuristic policy. Returns an error if `environment` has none.
 pub(super) fn weights(policy: &PolicySpec, environment: &Environment) -> Result<Weights> {
     let layers: [&[Unit<'_>]; 3] = match environment.name.as_str() {
-        "CartPole" => [&[(&[0.0, 0.0, 4.0 * STEEP, STEEP], 0.0)], SIGN, &[(&[-SURE], 0.0), (&[SURE], 0.0)]],
-        "MountainCar" => [&[(&[-0.001 * STEEP, STEEP], -0.001 * FRAC_PI_6 * STEEP)], SIGN, THREE_CHOICES],
-        "Acrobot" => [&[(&[0.0, 0.0, 0.0, 0.0, -2.0 * STEEP, STEEP], 0.0)], SIGN, THREE_CHOICES],
+        "CartPole" => {
+            [&[(&[0.0, 0.0, 4.0 * SATURATION, SATURATION], 0.0)], SIGN, &[(&[-MAX_LOGIT], 0.0), (&[MAX_LOGIT], 0.0)]]
+        }
+        "MountainCar" => {
+            [&[(&[-0.001 * SATURATION, SATURATION], -0.001 * FRAC_PI_6 * SATURATION)], SIGN, THREE_CHOICES]
+        }
+        "Acrobot" => [&[(&[0.0, 0.0, 0.0, 0.0, -2.0 * SATURATION, SATURATION], 0.0)], SIGN, THREE_CHOICES],
         "Pendulum" => PENDULUM,
         name => return Err(TrainError::NoHeuristic { environment: name.into() }),
     };
@@ -48,7 +52,7 @@ pub(super) fn weights(policy: &PolicySpec, environment: &Environment) -> Result<
     let array = |(name, shape): (String, Vec<usize>)| {
         let mut data = vec![0.0; shape.iter().product()];
         if name == "log_std" {
-            data.fill(EXACT);
+            data.fill(LOG_STD);
         }
         for (i, layer) in layers.iter().enumerate() {
             for (row, (weights, bias)) in layer.iter().enumerate() {
@@ -65,10 +69,10 @@ pub(super) fn weights(policy: &PolicySpec, environment: &Environment) -> Result<
 }
 
 /// The second layer of a rule that follows from a sign: passes on ±1, the output of the first layer's first unit.
-const SIGN: &[Unit<'_>] = &[(&[STEEP], 0.0)];
+const SIGN: &[Unit<'_>] = &[(&[SATURATION], 0.0)];
 
 /// The output of a rule that chooses the first action for -1, and the third action for 1.
-const THREE_CHOICES: &[Unit<'_>] = &[(&[-SURE], 0.0), (&[0.0], 0.0), (&[SURE], 0.0)];
+const THREE_CHOICES: &[Unit<'_>] = &[(&[-MAX_LOGIT], 0.0), (&[0.0], 0.0), (&[MAX_LOGIT], 0.0)];
 
 /// The network of Pendulum's rule, whose inputs are cos θ, sin θ and θ̇.
 ///
@@ -77,12 +81,12 @@ const THREE_CHOICES: &[Unit<'_>] = &[(&[-SURE], 0.0), (&[0.0], 0.0), (&[SURE], 0
 /// is 1, and add up to 0 otherwise. The last two units are both `gain` if `above` is -1, and add up to 0 otherwise. The
 /// torque is the sum of these four units.
 const PENDULUM: [&[Unit<'_>]; 3] = [
-    &[(&[STEEP], 0.1 * STEEP), (&[0.0, 0.0, STEEP], 0.0), (&[0.0, -2.0, -0.5], 0.0)],
+    &[(&[SATURATION], 0.1 * SATURATION), (&[0.0, 0.0, SATURATION], 0.0), (&[0.0, -2.0, -0.5], 0.0)],
     &[
-        (&[SURE, 0.0, 5.0], -SURE),
-        (&[-SURE, 0.0, 5.0], SURE),
-        (&[SURE, SURE / 2.0, 0.0], SURE),
-        (&[-SURE, SURE / 2.0, 0.0], -SURE),
+        (&[MAX_LOGIT, 0.0, 5.0], -MAX_LOGIT),
+        (&[-MAX_LOGIT, 0.0, 5.0], MAX_LOGIT),
+        (&[MAX_LOGIT, MAX_LOGIT / 2.0, 0.0], MAX_LOGIT),
+        (&[-MAX_LOGIT, MAX_LOGIT / 2.0, 0.0], -MAX_LOGIT),
     ],
     &[(&[1.0, 1.0, 1.0, 1.0], 0.0)],
 ];

@@ -73,7 +73,7 @@ pub fn undisturbed(spec: &EnvironmentSpec) -> &EnvironmentSpec {
 pub fn has_noise(spec: &EnvironmentSpec, distributions: &[Distribution]) -> bool {
     let mut parameters = spec.parameters.iter().cycle().zip(distributions);
     parameters.any(|(parameter, distribution)| {
-        parameters::NOISES.contains(&parameter.name) && distribution.fixed_value() != Some(0.0)
+        parameters::NOISE_PARAMETERS.contains(&parameter.name) && distribution.fixed_value() != Some(0.0)
     })
 }
 

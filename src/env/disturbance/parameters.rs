@@ -23,7 +23,7 @@ const MAX_PUSH_INTERVAL: f64 = 1e6;
 /// Maximal number of steps before or between changes of the physics.
 const MAX_CHANGE_STEPS: f64 = 1e6;
 /// The names of the noise of actions, and of the noise of observations.
-pub(super) const NOISES: [&str; 2] = ["action_noise", "sensor_noise"];
+pub(super) const NOISE_PARAMETERS: [&str; 2] = ["action_noise", "sensor_noise"];
 /// The name of the scale of all actuators, and the prefix of the names of the scales of single actuators.
 const ACTION_SCALE: &str = "action_scale";
 

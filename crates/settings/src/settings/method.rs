@@ -4,7 +4,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use super::{Observe, Preset};
+use super::{Observe, Preset, Settings};
 
 /// A method, which is a row of the tables of Packer et al. (2018): an algorithm with its architecture and, for RL²,
 /// the number of episodes in a trial.
@@ -31,7 +31,8 @@ pub struct Method {
 impl Method {
     /// Returns whether the method learns, unlike the random policy and the heuristic policies.
     pub fn learns(&self) -> bool {
-        self.external || !matches!(self.algorithm.as_str(), "random" | "heuristic")
+        let known = Settings::all().into_iter().find(|settings| settings.name() == self.algorithm);
+        self.external || known.is_none_or(|settings| settings.learns())
     }
 
     /// Returns whether the method only serves as a reference: it learns nothing, or its policies observe parameters
