@@ -8,6 +8,7 @@ use perturb::{
     proto::{self, AutoresetMode, EpisodeStart, Open, Release, Reset, Restore, SlotGroup},
     tasks,
 };
+use tonic::Code;
 
 /// The values of length and mass in four contexts.
 const ROWS: [[f64; 2]; 4] = [[0.3, 0.1], [0.3, 0.2], [0.6, 0.3], [0.7, 0.05]];
@@ -199,6 +200,16 @@ async fn environments_of_a_session_share_their_contexts() {
     let (_session, _) = Session::open(server.unix(), with(contexts(&["length"], &lengths), ENVS)).await;
     let grown = server.memory().saturating_sub(before);
     assert!(grown < 100 << 20, "{grown} bytes for {ENVS} environments");
+}
+
+#[tokio::test]
+async fn each_environment_reserves_memory_for_its_own_list() {
+    let server = Server::start(&["--max-memory", "9000000"]);
+    let open = |envs| with(contexts(&["length"], &[0.5; 1000]), envs);
+    let (_session, _) = Session::open(server.unix(), open(10)).await;
+    // Resets of single environments could give each of them a list of some 200 kB.
+    let mut other = Session::connect(server.unix()).await;
+    assert_eq!(other.refused(open(100)).await.0, Code::ResourceExhausted);
 }
 
 #[tokio::test]

@@ -148,11 +148,12 @@ mod tests {
 
     #[test]
     fn other_environments_have_no_heuristic_policy() {
-        let kind = Kind::Discrete(Discrete { names: vec![String::new(); 2] });
-        let error = actions("Hopper", kind, &[[0.0]]).unwrap_err().to_string();
-        assert_eq!(
-            error,
-            "there is no heuristic policy for Hopper; CartPole, MountainCar, Acrobot and Pendulum have one"
-        );
+        // The second environment has only the name of a known one.
+        for name in ["Hopper", "Acrobot"] {
+            let kind = Kind::Discrete(Discrete { names: vec![String::new(); 2] });
+            let error = actions(name, kind, &[[0.0; 6]]).unwrap_err().to_string();
+            let expected = "; CartPole, MountainCar, Acrobot and Pendulum have one";
+            assert_eq!(error, format!("there is no heuristic policy for {name}{expected}"));
+        }
     }
 }
