@@ -13,9 +13,11 @@ from pathlib import Path
 
 import perturb
 import results_changes
+import results_factors
 import results_given
 import results_lines
 import results_pages
+import results_paper
 from results_numbers import Studies
 from results_words import Near, Pattern
 
@@ -33,7 +35,9 @@ PAGES = {
     "docs/findings/beyond.md": results_pages.beyond,
     "docs/findings/cart-pole-ties.md": results_pages.cart_pole,
     "docs/findings/locomotion.md": results_pages.locomotion,
+    "docs/findings/one-factor.md": results_factors.one_factor,
     "docs/findings/paper-claims.md": results_pages.claims,
+    "docs/findings/paper-items.md": results_paper.paper_items,
     "docs/findings/pendulum-ppo.md": results_pages.pendulum,
     "docs/findings/recurrent.md": results_pages.recurrent,
     "docs/findings/reference-lines.md": results_lines.reference_lines,

@@ -86,6 +86,20 @@ GIVEN = {
         r"95 % Wilson intervals over the 3 000 episodes",
         r"after 100 and 50 steps",
     ],
+    "docs/findings/one-factor.md": [
+        # From the script, and from Student's distribution.
+        r"five seeds \(7 to 11\)",
+        r"200 episodes for each policy",
+        r"95 % t interval of a mean extends 1\.4 standard deviations",
+        r"near 0 and 100 %",
+    ],
+    "docs/findings/paper-items.md": [
+        r"Packer et al\., 2018",
+        # From the paper's tables.
+        r"Each environment has 42 numbers: 14 methods",
+        # From the binomial distribution.
+        r"expected in 27 % of the cases",
+    ],
     "docs/findings/reference-lines.md": [
         # From the plan, and from the binomial distribution.
         r"1 000 on each of D, R and E with each of the seeds 7 to 11",
@@ -104,6 +118,7 @@ GIVEN = {
 # Pairs of a regular expression and the replacement of its match. The first pair that matches a command is used.
 # SCRATCH stands for an empty folder.
 SMALL = [
+    (r"^(perturb heatmap .*) --out \S+", r"\1 --grid 3 --episodes 2 --out SCRATCH/heatmap"),
     (r"^perturb audit results$", "perturb audit results/policies/CartPole-ppo-ff-R-9bd6546b-s7.safetensors"),
     (r"^(perturb report results\S*(?: --selection paper)?) --out \S+", r"\1 --out SCRATCH/report"),
     (r"^(perturb evaluate .*)", r"\1 --episodes 20"),
