@@ -5,7 +5,7 @@ from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
 
-from results_numbers import ENVIRONMENTS
+from results_numbers import ENVIRONMENTS, t_interval
 from results_words import fill, fixed, spread
 
 COUNTS = Path("experiments/references/one_factor.csv")
@@ -47,36 +47,42 @@ def one_factor(_):
 
 
 def pairs(found):
-    """Return the rows of the table of pairs: measured success, and the success that independent effects would give."""
-    texts = []
+    """Return the texts on pairs of parameters, on all parameters and on the differences between training versions."""
+    texts, mean = [], {key: fmean(runs) for key, runs in found.items()}
     for task, pair in (("Pendulum", (0, 1)), ("Acrobot", (0, 1)), ("Acrobot", (0, 2)), ("Acrobot", (1, 2))):
         parameters = names()[task]
 
-        def mean(*high, task=task, parameters=parameters):
-            regions = tuple("high" if place in high else "R" for place in range(len(parameters)))
-            return fmean(found[task, "R", regions])
+        def high(*places, task=task, parameters=parameters):
+            return mean[task, "R", tuple("high" if place in places else "R" for place in range(len(parameters)))]
 
-        first, second = (mean(place) for place in pair)
-        row = [mean(), first, second, mean(*pair), first * second / mean()]
+        first, second = (high(place) for place in pair)
+        independent = first * second / high()
+        assert high(*pair) < independent, f"{task}, {pair}"
         label = " and ".join(parameters[place] for place in pair)
+        row = [high(), first, second, high(*pair), independent]
         texts.append(f"| {task} | {label} | " + " | ".join(map(fixed, row)) + " |")
-    ends = [fmean(found["Acrobot", "R", (end, end, end)]) for end in ("low", "high")]
-    rod = [fmean(found["Pendulum", "R", (region, "R")]) for region in ("R", "high", "low")]
-    links = [fmean(found["Acrobot", "R", (region, "R", "R")]) for region in ("R", "high")]
-    gains = defaultdict(list)
-    for (task, trained, regions), runs in found.items():
-        if trained == "R" and sum(region != "R" for region in regions) <= 1:
-            gains[task].append(fmean(runs) - fmean(found[task, "D", regions]))
     for end, expected in (("low", 0), ("high", 100)):  # no episode with a weak push succeeds, all with a strong push do
         pushed = [runs for (task, _, regions), runs in found.items() if task == "MountainCar" and regions[0] == end]
         assert all(rate == expected for runs in pushed for rate in runs), end
-    lowest = min(fmean(runs) for (task, _, _), runs in found.items() if task == "CartPole")
+    rod = [mean["Pendulum", "R", (region, "R")] for region in ("R", "high")]
+    links = [mean["Acrobot", "R", ("R", region, "R")] for region in ("R", "high")]
+    ends = [mean["Acrobot", "R", (end, end, end)] for end in ("low", "high")]
+    cart_pole = [runs for (task, _, _), runs in found.items() if task == "CartPole"]
+    long_rod = zip(*(found["Pendulum", trained, ("high", "R")] for trained in "RD"), strict=True)
+    gain, low, high = t_interval([[on_r - on_d for on_r, on_d in long_rod]])
+    gains = [
+        value - mean[task, "D", regions]
+        for (task, trained, regions), value in mean.items()
+        if trained == "R" and task != "Pendulum" and sum(region != "R" for region in regions) <= 1
+    ]
     return [
         *texts,
+        fill("a long rod alone lowers success on Pendulum from {:.0f} to {:.0f} %", *rod),
+        fill("heavy links alone lower it from {:.0f} to {:.0f} %", *links),
+        fill("a mean that is {:.1f} points higher", gain),
+        fill("interval of {:.1f} to {:.1f} points", low, high),
+        fill("no mean of the table by more than {:.1f} points", max(gains)),
         fill("succeed in {:.1f} % of the episodes if all three are low, and in {:.1f} % if all three are high", *ends),
-        fill("a long rod alone lowers success from {:.0f} to {:.0f} %, and a short rod raises it to {:.0f} %", *rod),
-        fill("long links alone lower success from {:.0f} to {:.0f} %", *links),
-        fill("success with a long rod by {:.1f} points", max(gains.pop("Pendulum"))),
-        fill("no mean of the table by more than {:.1f} points", max(map(max, gains.values()))),
-        fill("in at least {:.1f} % of the episodes for every combination", lowest),
+        fill("is at least {:.1f} % for every combination", min(map(fmean, cart_pole))),
+        fill("the lowest result of a single policy is {:.1f} %", min(map(min, cart_pole))),
     ]

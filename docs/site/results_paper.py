@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from statistics import fmean
 
 from results_numbers import ENVIRONMENTS, std
-from results_words import CLEAN, FF, NAMES, spread
+from results_words import CLEAN, FF, NAMES, fill, spread
 
 # The studies that repeat the paper's methods with seeds that did not select a configuration.
 STUDIES = ("classic-ff", "classic-rc", "questions/findings", "beyond/confirm-2", "locomotion")
@@ -50,16 +50,18 @@ def paper_items(studies):
         total += counts
         texts.append(f"| {environment} | " + " | ".join(str(counts[name]) for name in KINDS) + " |")
     texts.append("| all | " + " | ".join(str(total[name]) for name in KINDS) + " |")
-    texts.append(
-        f"Of the {len(known)} numbers in its tables of environments, {total['five']} are repeated here with five"
-    )
-    return texts + stability(studies)
+    five, none = total["five"], total["none"]
+    answer = [
+        f"The paper has {len(known)} numbers for single environments",
+        f"For {five} of them, studies of this project have at least five seeds, and for {none} of them no seed",
+    ]
+    return [*texts, *answer, *stability(studies)]
 
 
 def stability(studies):
     """Return the rows and counts of the section on training with random physics."""
-    texts = []
-    steadier = better = pairs = 0
+    texts, gains = [], {}
+    steadier = steadier_on_d = 0
     for task in ENVIRONMENTS:
         for name in FF:
             runs = {}
@@ -67,17 +69,24 @@ def stability(studies):
                 cells = studies.finished("questions/findings", environment=task, algorithm=name, trained_on=version)
                 runs[version] = sorted((cell for cell in cells if cell.seed in CLEAN), key=lambda cell: cell.seed)
                 assert len(runs[version]) == len(CLEAN), f"{task}, {name}, {version}: {len(runs[version])} seeds"
-            own = {version: [cell.success(version) for cell in cells] for version, cells in runs.items()}
-            on_d = {version: [cell.success("D") for cell in cells] for version, cells in runs.items()}
-            if not any(own["D"]):
-                continue  # never learns the fixed environment
-            pairs += 1
-            steadier += std(own["R"]) < std(own["D"])
-            better += fmean(on_d["R"]) > fmean(on_d["D"])
-            row = [spread(own["D"]), spread(own["R"]), spread(on_d["R"])]
+            on_d, on_r, on_d_after_r = (
+                [cell.success(tested) for cell in runs[trained]] for trained, tested in ("DD", "RR", "RD")
+            )
+            if not any(on_d):
+                continue
+            steadier += std(on_r) < std(on_d)
+            steadier_on_d += std(on_d_after_r) < std(on_d)
+            gains[NAMES[name], task] = fmean(on_d_after_r) - fmean(on_d)
+            row = [spread(on_d), spread(on_r), spread(on_d_after_r)]
             texts.append(f"| {task} | {NAMES[name]} | " + " | ".join(row) + " |")
+    pairs = COUNTS[len(gains)]
+    better = COUNTS[sum(gain > 0 for gain in gains.values())]
+    most, least = max(gains, key=gains.get), min(gains, key=gains.get)
     return [
         *texts,
-        f"in {COUNTS[steadier]} of {COUNTS[pairs]} pairs the results on R vary less than those on D",
-        f"In {COUNTS[better]} of the {COUNTS[pairs]} pairs",
+        f"In {COUNTS[steadier]} of the {pairs} pairs, the results on R vary less than those on D",
+        f"those trained on R vary less in {COUNTS[steadier_on_d]} of the {pairs} pairs",
+        f"In {better} of the {pairs} pairs, policies trained on R have a higher",
+        fill("largest gain is {:.1f} points ({} on {})", gains[most], *most),
+        fill("largest loss is {:.1f} points ({} on {})", -gains[least], *least),
     ]
