@@ -108,6 +108,10 @@ GIVEN = {
         # From the plan, and from the binomial distribution.
         r"1 000 on each of D, R and E with each of the seeds 7 to 11",
         r"95 % interval of a rate from 5 000 episodes is at most ±1\.4 points, and ±0\.6 points at a rate of 95 %",
+        # From the experiment file.
+        r"ten seeds \(31 to 40\)",
+        r"with 1 000 episodes in each test",
+        r"95 % t interval over the seeds",
         # From the rules of success.
         r"in the last 100 steps|in 110 steps",
         # From the errors that upper_bound.py prints, and its column smallest_miss.

@@ -5,14 +5,17 @@ from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
 
-from results_numbers import ENVIRONMENTS, METRICS, cube_root
-from results_words import fill, fixed
+from results_numbers import ENVIRONMENTS, METRICS, cube_root, holm, sign_flip_p, t_interval
+from results_words import NAMES, Near, fill, fixed, spread
 
 BOUNDS = Path("experiments/references/upper_bound.csv")
 PAPER_BEST = "paper's best"
 # Policies with fewer seeds do not count as learned policies.
 MIN_SEEDS = 3
 # Studies with other dynamics or other tests than the paper's.
+# The setting `observe`, which is missing if policies see only the state.
+OBSERVED = {"parameters": "seen", None: "not seen"}
+LEARNED_SEEDS = 10
 EXCLUDED = ("classic", "heuristic", "references")
 
 
@@ -93,7 +96,7 @@ def reference_lines(studies):
         texts.append(f"| {environment} | | | | |")
         texts += [line(name, rates) for name, rates in shown.items()]
         rows[environment] = shown
-    return [*texts, *answer(rows), *mountain_car(studies, rows["MountainCar"], known)]
+    return [*texts, *answer(rows), *learned(studies), *mountain_car(studies, rows["MountainCar"], known)]
 
 
 def answer(rows):
@@ -106,6 +109,36 @@ def answer(rows):
         fill("The best learned policies succeed in {:.0f} and {:.0f} %", *learned),
         fill("no policy can solve more than {:.0f} % of R and {:.0f} % of E", *bound[1:3]),
         fill("best Extrapolation is {:.1f} %, and the upper bound {:.1f} %", paper[3], bound[3]),
+    ]
+
+
+def learned(studies):
+    """Return the rows of the table of policies trained on R+E, and the texts that compare them."""
+    texts, seen, p = [], {}, {}
+    for environment in ENVIRONMENTS:
+        for algorithm in ("ppo", "a2c"):
+            found = {}
+            for observed, label in OBSERVED.items():
+                cells = studies.finished("references", environment=environment, algorithm=algorithm, observe=observed)
+                assert len(cells) == LEARNED_SEEDS, f"{environment}, {algorithm}, {observed}: {len(cells)} seeds"
+                cells.sort(key=lambda cell: cell.seed)
+                found[observed] = {version: [cell.success(version) for cell in cells] for version in "DRE"}
+                row = " | ".join(map(spread, found[observed].values()))
+                texts.append(f"| {environment}, {NAMES[algorithm]} | {label} | {row} |")
+            for version in "DRE":
+                pairs = zip(found["parameters"][version], found[None][version], strict=True)
+                seen[environment, algorithm, version] = [with_them - without for with_them, without in pairs]
+                p[environment, algorithm, version] = sign_flip_p(seen[environment, algorithm, version])
+    corrected = dict(zip(p, holm(list(p.values())), strict=True))
+    significant = [key for key, value in corrected.items() if value < 0.05]
+    assert significant == [("MountainCar", "a2c", "R")], significant
+    loss = -fmean(seen["MountainCar", "a2c", "R"])
+    gain, low, high = t_interval([seen["MountainCar", "a2c", "D"]])
+    return [
+        *texts,
+        f"Of the {len(p)} differences",
+        Near("A2C on MountainCar is @ points worse on R (corrected p @)", [loss, min(corrected.values())], 0.051),
+        fill("{:.1f} points better on D [{:.1f}, {:.1f}]", gain, low, high),
     ]
 
 

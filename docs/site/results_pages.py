@@ -92,6 +92,7 @@ STUDIES = {
     "[beyond], [nine studies] |": ("beyond/", None),
     "[locomotion] |": ("locomotion", 72),
     "[heuristic] |": ("heuristic", None),
+    "[references] |": ("references", None),
     "[changes] |": ("changes", 36),
     "locomotion-rate |": ("locomotion-rate", None),
     "classic |": ("classic", 72),
