@@ -143,12 +143,13 @@ impl DisturbanceSet {
             entries.push((DisturbanceKind::ActionNoise, noise.off(0.0)));
             let scale = |name, description| (share(name, description, MAX_FACTOR)).off(1.0);
             entries.push((DisturbanceKind::ActionScale, scale(ACTION_SCALE, "factor on all actions")));
-            let own = channels.iter().take(MAX_SCALED_ACTUATORS).enumerate().map(|(place, channel)| {
+            // A single actuator needs no factor of its own.
+            let own = if channels.len() > 1 { MAX_SCALED_ACTUATORS } else { 0 };
+            entries.extend(channels.iter().take(own).enumerate().map(|(place, channel)| {
                 let name: &'static str = String::leak(format!("{ACTION_SCALE}_{}", channel.name));
                 let description: &'static str = String::leak(format!("factor on the action of {}", channel.name));
                 (DisturbanceKind::ActuatorScale(place), scale(name, description))
-            });
-            entries.extend(own.filter(|_| channels.len() > 1));
+            }));
         }
         if let Some(push) = spec.push {
             let size = ParameterSpec::new("push", push.unit, push.description, (0.0, MAX_PUSH)).off(0.0);
