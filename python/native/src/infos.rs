@@ -297,28 +297,22 @@ impl Events {
         let (py, labels) = (infos.py(), &*self.labels);
         let (fixed, slot) = (&labels.fixed, |row: &[u64; 5]| row[0] as usize);
         let (_, mask) = self.mask(py, rows().map(|(row, _)| slot(&row)));
-        let indices = rows().map(|(row, _)| (slot(&row), [row[2], row[1], row[2], row[3]].map(|index| index as i64)));
-        let mut indices = self.columns(py, 4, indices)?;
-        let values = rows().map(|(row, values)| (slot(&row), values.iter().copied()));
-        let mut values = self.columns(py, labels.parameters.len() + labels.applied.len(), values)?;
-        let mut named = |labels: &[Label]| {
+        let count = |index: usize| self.column(py, rows().map(move |(row, _)| (row[0] as usize, row[index] as i64)));
+        let named = |labels: &[Label], first: usize| {
             let named = PyDict::new(py);
-            for (label, column) in labels.iter().zip(&mut values) {
-                set(&named, label, column?, &mask)?;
+            for (i, label) in labels.iter().enumerate() {
+                let column = rows().map(|(row, values)| (slot(&row), values[first + i]));
+                set(&named, label, self.column(py, column), &mask)?;
             }
             PyResult::Ok(named)
         };
-        if let Some(contexts) = indices.next() {
-            set(infos, &fixed.context_id, contexts?, &mask)?;
-        }
-        set(infos, &fixed.parameters, named(&labels.parameters)?, &mask)?;
+        set(infos, &fixed.context_id, count(2), &mask)?;
+        set(infos, &fixed.parameters, named(&labels.parameters, 0)?, &mask)?;
         let receipt = PyDict::new(py);
-        for (label, column) in
-            [&fixed.environment_index, &fixed.trial_index, &fixed.episode_index].into_iter().zip(indices)
-        {
-            set(&receipt, label, column?, &mask)?;
+        for (index, label) in [(1, &fixed.environment_index), (2, &fixed.trial_index), (3, &fixed.episode_index)] {
+            set(&receipt, label, count(index), &mask)?;
         }
-        set(&receipt, &fixed.applied, named(&labels.applied)?, &mask)?;
+        set(&receipt, &fixed.applied, named(&labels.applied, labels.parameters.len())?, &mask)?;
         let mut hashes = vec![0; labels.num_envs * HASH_BYTES];
         rows().for_each(|(row, _)| {
             hashes[slot(&row) * HASH_BYTES..][..HASH_BYTES].copy_from_slice(&labels.model_hash_bytes);
@@ -351,23 +345,6 @@ impl Events {
         let mut column = vec![T::default(); self.labels.num_envs];
         values.for_each(|(slot, value)| column[slot] = value);
         PyArray1::from_vec(py, column)
-    }
-
-    /// Makes `count` arrays `[N]` from pairs of a slot and a value for each array. Slots without values are zero. The
-    /// arrays are rows of one array, because separate arrays take longer to make.
-    fn columns<'py, T: Element + Copy + Default>(
-        &self,
-        py: Python<'py>,
-        count: usize,
-        values: impl Iterator<Item = (usize, impl IntoIterator<Item = T>)>,
-    ) -> PyResult<impl Iterator<Item = PyResult<Bound<'py, PyAny>>>> {
-        let n = self.labels.num_envs;
-        let mut columns = vec![T::default(); count * n];
-        for (slot, values) in values {
-            values.into_iter().enumerate().for_each(|(row, value)| columns[row * n + slot] = value);
-        }
-        let columns = PyArray1::from_vec(py, columns).reshape([count, n])?;
-        Ok((0..count).map(move |row| columns.get_item(row)))
     }
 
     /// Makes the mask `[N]` of `slots`. The array is read-only, because several keys share it.
