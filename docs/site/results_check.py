@@ -13,6 +13,7 @@ from pathlib import Path
 
 import perturb
 import results_changes
+import results_contexts
 import results_factors
 import results_given
 import results_lines
@@ -42,6 +43,7 @@ PAGES = {
     "docs/findings/recurrent.md": results_pages.recurrent,
     "docs/findings/reference-lines.md": results_lines.reference_lines,
     "docs/findings/rl2-trials.md": results_pages.rl2,
+    "docs/findings/training-contexts.md": results_contexts.training_contexts,
 }
 # The part of README.md that has results: its first heading, and the first heading after it.
 SECTIONS = {"README.md": ("## The benchmark", "## Install")}

@@ -8,14 +8,14 @@ from statistics import fmean
 from results_numbers import ENVIRONMENTS, t_interval
 from results_words import fill, fixed, spread
 
-COUNTS = Path("experiments/references/one_factor.csv")
+RATES_FILE = Path("experiments/references/one_factor.csv")
 REGIONS = ("low", "R", "high")
 
 
 def rates():
     """Return the success of each seed's policy, %, by task, training version and the parameters' intervals."""
     found = defaultdict(list)
-    with COUNTS.open() as file:
+    with RATES_FILE.open() as file:
         for row in csv.DictReader(file):
             regions = tuple(text.split("=")[1] for text in row["parameters"].split())
             rate = 100 * int(row["successes"]) / int(row["episodes"])
@@ -25,7 +25,7 @@ def rates():
 
 def names():
     """Return the names of each task's parameters, in the order of one_factor.csv."""
-    with COUNTS.open() as file:
+    with RATES_FILE.open() as file:
         rows = list(csv.DictReader(file))
     return {row["environment"]: [text.split("=")[0] for text in row["parameters"].split()] for row in rows}
 
@@ -64,6 +64,11 @@ def pairs(found):
     for end, expected in (("low", 0), ("high", 100)):  # no episode with a weak push succeeds, all with a strong push do
         pushed = [runs for (task, _, regions), runs in found.items() if task == "MountainCar" and regions[0] == end]
         assert all(rate == expected for runs in pushed for rate in runs), end
+    for place in range(3):  # on Acrobot, high values are harder than R, and low values easier
+        low, middle, high = (
+            mean["Acrobot", "R", tuple(region if other == place else "R" for other in range(3))] for region in REGIONS
+        )
+        assert low > middle > high, f"{names()['Acrobot'][place]}: {low}, {middle}, {high}"
     rod = [mean["Pendulum", "R", (region, "R")] for region in ("R", "high")]
     links = [mean["Acrobot", "R", ("R", region, "R")] for region in ("R", "high")]
     ends = [mean["Acrobot", "R", (end, end, end)] for end in ("low", "high")]

@@ -93,6 +93,7 @@ STUDIES = {
     "[locomotion] |": ("locomotion", 72),
     "[heuristic] |": ("heuristic", None),
     "[references] |": ("references", None),
+    "[contexts] |": ("contexts", 400),
     "[changes] |": ("changes", 36),
     "locomotion-rate |": ("locomotion-rate", None),
     "classic |": ("classic", 72),
@@ -111,6 +112,9 @@ def named(studies, name):
 def results(studies):
     texts = []
     missing = {}
+    listed = {study for name, _ in STUDIES.values() for study in named(studies, name)}
+    unlisted = {cell.study for cell in studies.cells} - listed
+    assert not unlisted, f"results/README.md has no row for {unlisted}"
     for start, (name, planned) in STUDIES.items():
         counts = [studies.planned(study) for study in named(studies, name)]
         done, failed = sum(count[0] for count in counts), sum(count[1] for count in counts)
@@ -143,6 +147,7 @@ def results(studies):
         f"{share} selected configurations of classic-ff",
         f"classic-rc: {missing['classic-rc']} cells",
         f"locomotion: {missing['locomotion']} cells",
+        f"contexts: {missing['contexts']} cells are missing",
     ]
 
 

@@ -18,7 +18,7 @@ TESTS = {"own": "the contexts of the training", "R": "R", "E": "E"}
 
 def main():
     results = perturb.read_results("results/results.parquet")
-    results = results[results.study == "contexts"]
+    results = results[(results.study == "contexts") & (results.seed <= 35)]
     figure, panels = plt.subplots(
         len(ALGORITHMS), len(TASKS), figsize=(9, 4.5), sharex=True, sharey=True, layout="constrained"
     )

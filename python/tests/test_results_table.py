@@ -17,7 +17,7 @@ TABLE = ROOT / "results/results.parquet"
 def test_the_published_table_has_every_study_with_its_plan() -> None:
     pytest.importorskip("pandas")
     results = perturb.read_results(TABLE, settings=["learning_rate", "no_such_setting"])
-    assert results.study.nunique() == len(results.attrs["plans"]) >= 20
+    assert set(results.study) == set(results.attrs["plans"])
     assert "[[algorithm]]" in results.attrs["plans"]["classic-ff"]
     row = results[(results.study == "classic-ff") & (results.cell == "CartPole-ppo-ff-R-35f87fe3-s2")].iloc[0]
     assert (row.tested_on, row.episodes, row.learning_rate, row.no_such_setting) == ("D", 1000, 3e-4, None)
