@@ -76,9 +76,17 @@ pub fn spawn<T: Send + 'static>(
     name: String,
     future: impl Future<Output = T> + Send + 'static,
 ) -> io::Result<impl Future<Output = io::Result<T>>> {
-    let runtime = Builder::new_current_thread().enable_all().build()?;
     let (mut done, output) = oneshot::channel();
     let run = move || {
+        // The runtime is built here, because dropping a runtime in an async context panics, and the caller's context
+        // drops `run` if the thread cannot start.
+        let runtime = match Builder::new_current_thread().enable_all().build() {
+            Ok(runtime) => runtime,
+            Err(error) => {
+                let _ = done.send(Err(error)); // fails if the result is no longer wanted
+                return;
+            }
+        };
         let ended = runtime.block_on(async {
             tokio::select! {
                 output = future => Some(output),
@@ -88,11 +96,11 @@ pub fn spawn<T: Send + 'static>(
         // The thread does not wait for connections that are still open.
         runtime.shutdown_background();
         if let Some(output) = ended {
-            let _ = done.send(output); // fails if the result is no longer wanted
+            let _ = done.send(Ok(output)); // fails if the result is no longer wanted
         }
     };
     thread::Builder::new().name(name).spawn(run).map_err(|error| explain_no_thread(&error))?;
     Ok(async {
-        output.await.map_err(|_| io::Error::other("a transport thread ended because of a defect of the server"))
+        output.await.map_err(|_| io::Error::other("a transport thread ended because of a defect of the server"))?
     })
 }

@@ -7,6 +7,7 @@ use std::os::unix::fs::PermissionsExt;
 
 #[rstest]
 #[case::alone(&[])]
+#[case::with_two_transport_threads(&["--transport-threads", "2"])]
 #[case::with_a_ledger(&["--tokens", "DIR/tokens", "--ledger", "DIR/ledger"])]
 #[cfg_attr(feature = "mujoco", case::with_a_task(&["--task", concat!(env!("CARGO_MANIFEST_DIR"), "/examples/tasks/my_arm")]))]
 fn a_server_that_may_have_few_threads_names_the_limit(#[case] flags: &[&str]) {
