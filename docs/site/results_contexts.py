@@ -10,7 +10,7 @@ CONTEXT_COUNTS = (1, 4, 16, 64, 256)
 SEEDS = range(31, 36)
 
 
-def rates(studies):
+def numbers(studies):
     """Return a number for each seed's policy, by task, algorithm, number of contexts and kind of number.
 
     The kinds are the tests `own`, the contexts of the training, `R` and `E`, with success in %, and `episodes`, the
@@ -32,7 +32,7 @@ def rates(studies):
 
 def training_contexts(studies):
     """Return the texts with numbers that the page must contain."""
-    found = rates(studies)
+    found = numbers(studies)
     texts = []
     for task, algorithm, count, test in found:
         if test == "own":

@@ -32,9 +32,9 @@ def names():
 
 def one_factor(_):
     """Return the texts with numbers that the page must contain."""
-    found, texts = rates(), []
+    found, texts, named = rates(), [], names()
     for task in ENVIRONMENTS:
-        parameters = names()[task]
+        parameters = named[task]
         for trained in "DR":
             for place, parameter in enumerate(parameters):
                 row = []
@@ -43,14 +43,17 @@ def one_factor(_):
                     regions[place] = region
                     row.append(spread(found[task, trained, tuple(regions)]))
                 texts.append(f"| {task} | {parameter} | {trained} | " + " | ".join(row) + " |")
-    return texts + pairs(found)
+    return texts + comparisons(found, named)
 
 
-def pairs(found):
-    """Return the texts on pairs of parameters, on all parameters and on the differences between training versions."""
+def comparisons(found, named):
+    """Return the texts that compare settings, pairs of settings and training versions.
+
+    `named` has the names of each task's parameters.
+    """
     texts, mean = [], {key: fmean(runs) for key, runs in found.items()}
     for task, pair in (("Pendulum", (0, 1)), ("Acrobot", (0, 1)), ("Acrobot", (0, 2)), ("Acrobot", (1, 2))):
-        parameters = names()[task]
+        parameters = named[task]
 
         def high(*places, task=task, parameters=parameters):
             return mean[task, "R", tuple("high" if place in places else "R" for place in range(len(parameters)))]
@@ -68,7 +71,7 @@ def pairs(found):
         low, middle, high = (
             mean["Acrobot", "R", tuple(region if other == place else "R" for other in range(3))] for region in REGIONS
         )
-        assert low > middle > high, f"{names()['Acrobot'][place]}: {low}, {middle}, {high}"
+        assert low > middle > high, f"{named['Acrobot'][place]}: {low}, {middle}, {high}"
     rod = [mean["Pendulum", "R", (region, "R")] for region in ("R", "high")]
     links = [mean["Acrobot", "R", ("R", region, "R")] for region in ("R", "high")]
     ends = [mean["Acrobot", "R", (end, end, end)] for end in ("low", "high")]

@@ -129,7 +129,7 @@ GIVEN = {
         r"last 100 episodes",
         r"five seeds \(31 to 35\), with about 1 000 episodes",
         r"ten seeds \(31 to 40\)",
-        r"as much as 256 contexts|256 contexts instead of one",
+        r"about as much as 256 contexts|256 contexts instead of one|with 256 contexts",
         r"with its 95 % t interval over the seeds",
         r"in 95 % of the cases",
     ],
