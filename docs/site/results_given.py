@@ -105,6 +105,7 @@ GIVEN = {
     "docs/findings/reference-lines.md": [
         # From the plan, and from the binomial distribution.
         r"1 000 on each of D, R and E with each of the seeds 7 to 11",
+        r"Of these 5 000 episodes on E",
         r"95 % interval of a rate from 5 000 episodes is at most ±1\.4 points, and ±0\.6 points at a rate of 95 %",
         # From the experiment file.
         r"ten seeds \(31 to 40\)",

@@ -1,4 +1,7 @@
-"""The numbers of docs/findings/reference-lines.md, from the results table and from upper_bound.csv."""
+"""The numbers of docs/findings/reference-lines.md, from the results table, upper_bound.csv and heuristic_rules.csv.
+
+Other pages have rows with reference lines. The functions of the first half compute these rows.
+"""
 
 import csv
 from collections import defaultdict
@@ -6,9 +9,14 @@ from pathlib import Path
 from statistics import fmean
 
 from results_numbers import ENVIRONMENTS, METRICS, cube_root, holm, sign_flip_p, t_interval
-from results_words import NAMES, fill, fixed, spread
+from results_words import FF, NAMES, fill, fixed, spread
 
 BOUNDS = Path("experiments/references/upper_bound.csv")
+# Successes of the heuristic policies by the success rules of the paper's text and of its code.
+RULES = Path("experiments/references/heuristic_rules.csv")
+# Indices of D, R and E, and of Default, Interpolation and Extrapolation, in the list of `with_extrapolation`.
+TESTS = (0, 1, 2)
+METRIC_PLACES = (0, 1, 3)
 PAPER_BEST = "paper's best"
 # Policies with fewer seeds do not count as learned policies.
 MIN_SEEDS = 3
@@ -47,6 +55,112 @@ def fixed_policy(studies, environment, algorithm):
     return with_extrapolation(*(fmean(cell.success(version) for cell in cells) for version in "DRE"))
 
 
+def heuristic(studies, environment, rule="code"):
+    """Return success of the heuristic policy on D, R and E, and its Extrapolation. `rule` is `code` or `text`."""
+    known = fixed_policy(studies, environment, "heuristic")
+    if rule == "code":
+        return known
+    with RULES.open() as file:
+        rows = [row for row in csv.DictReader(file) if row["environment"] == environment]
+
+    def rates(name):
+        tests = ([row for row in rows if row["version"] == version] for version in "DRE")
+        return with_extrapolation(
+            *(fmean(100 * int(row[name]) / int(row["episodes"]) for row in test) for test in tests)
+        )
+
+    for rate, again in zip(known, rates("code"), strict=True):
+        assert abs(rate - again) < 1e-6, f"{environment}: {rate} in the table, {again} in {RULES}"
+    return rates(rule)
+
+
+def upper_bound(environment):
+    """Return the shares of episodes on D, R and E that can be solved, and their Extrapolation. None if unknown."""
+    known = bounds()
+    if (environment, "D", "all") not in known:
+        return None
+    return with_extrapolation(*(share(known[environment, version, "all"], "solved", "undecided") for version in "DRE"))
+
+
+def averages(studies, rule="code"):
+    """Return the numbers of `heuristic`, averaged over the four tasks."""
+    return [fmean(numbers) for numbers in zip(*(heuristic(studies, task, rule) for task in ENVIRONMENTS), strict=True)]
+
+
+def joined(rates, digits=1, between=" | ", places=METRIC_PLACES):
+    """Return the rates at `places` as text, or – if `rates` is None."""
+    return "–" if rates is None else between.join(fixed(rates[place], digits) for place in places)
+
+
+def task_rows(studies, digits=0, rule="code", between=" / ", places=METRIC_PLACES, mean=False):
+    """Return the rows `heuristic` and `upper bound` of a table with a column for each task.
+
+    With `mean`, a last column has the averages over the tasks.
+    """
+    rows = {
+        "heuristic": [heuristic(studies, task, rule) for task in ENVIRONMENTS],
+        "upper bound": [upper_bound(task) for task in ENVIRONMENTS],
+    }
+    last = {"heuristic": averages(studies, rule), "upper bound": None}
+    texts = []
+    for name, tasks in rows.items():
+        fields = [joined(rates, digits, between, places) for rates in tasks]
+        fields += [joined(last[name], 1, between, places)] if mean else []
+        texts.append(f"| {name} | " + " | ".join(fields) + " |")
+    return texts
+
+
+def average_row(studies):
+    """Return the row `heuristic` of a table of four-task averages, and its lead over the paper's A2C."""
+    means = averages(studies)
+    lead = means[3] - studies.paper_mean(FF["a2c"], "Extrapolation")
+    return [f"| heuristic | | {joined(means)} |", fill("{:.1f} points above that of the paper's A2C", lead)]
+
+
+def version_rows(studies, environment, start, early):
+    """Return the rows of a table with success on D, R and E. `early` has the versions of the columns before these.
+
+    `start` follows the row's name: the fields that are empty.
+    """
+    rows = {"heuristic": heuristic(studies, environment), "upper bound": upper_bound(environment)}
+    places = [*("DRE".index(version) for version in early), *TESTS]
+    return [f"| {name} {start}| {joined(rates, places=places)} |" for name, rates in rows.items() if rates]
+
+
+def both_rules_row(studies):
+    """Return the row of Acrobot's heuristic policy: D, R and E, each within 80 steps and within 90 steps."""
+    by_text, by_code = heuristic(studies, "Acrobot", "text"), heuristic(studies, "Acrobot")
+    pairs = (f"{fixed(by_text[place])} | {fixed(by_code[place])}" for place in TESTS)
+    return "| heuristic | | | " + " | ".join(pairs) + " |"
+
+
+def trial_rows(studies):
+    """Return the rows of the tables of docs/findings/rl2-trials.md, by the rules of the paper's text."""
+    rows = {
+        "heuristic": {task: heuristic(studies, task, "text") for task in ENVIRONMENTS},
+        "upper bound": {task: upper_bound(task) for task in ENVIRONMENTS},
+    }
+    texts = []
+    for name, tasks in rows.items():
+        shown = {task: joined(rates, between=" / ") for task, rates in tasks.items()}
+        texts += [f"| {name} | | | | {shown[task]} |" for task, rates in tasks.items() if rates]
+        texts.append(f"| {name} | {shown['CartPole']} | | {shown['Pendulum']} | |")
+    return texts
+
+
+def search_rows(studies, margin):
+    """Return the rows of the tables of docs/findings/beyond.md. `margin` computes a margin from three averages."""
+    rows = [f"| {task}, heuristic | {joined(heuristic(studies, task))} |" for task in ENVIRONMENTS]
+    limits = {task: upper_bound(task) for task in ENVIRONMENTS}
+    rows += [f"| {task}, upper bound | {joined(rates)} |" for task, rates in limits.items() if rates]
+    means = averages(studies)
+    fields = [joined(means), fixed(margin([means[place] for place in METRIC_PLACES]))]
+    tasks = [joined(heuristic(studies, task), 0, "/") for task in ENVIRONMENTS]
+    last = " | ".join([*fields, *tasks])
+    lead = average_row(studies)[1]
+    return [*rows, f"| heuristic | {joined(means)} |", f"| heuristic | | | | {last} |", f"| heuristic | {last} |", lead]
+
+
 def best_learned(studies, environment):
     """Return the highest mean success of a configuration on D, R and E, and the highest mean Extrapolation."""
     groups = defaultdict(dict)
@@ -78,10 +192,10 @@ def paper_best(studies, environment):
     return [best("default"), best("interpolation"), None, best("extrapolation")]
 
 
-def reference_lines(studies):
-    """Return the texts with numbers that docs/findings/reference-lines.md must contain."""
+def rates_by_task(studies):
+    """Return the rates on D, R and E, and Extrapolation, by task and name of the reference line."""
     known = bounds()
-    rows, texts = {}, []
+    rows = {}
     for environment in ENVIRONMENTS:
         shown = {name: fixed_policy(studies, environment, name) for name in ("random", "heuristic")}
         counts = [known.get((environment, version, "all")) for version in "DRE"]
@@ -92,12 +206,18 @@ def reference_lines(studies):
             # The script simulates the rule of the heuristic policy in the same episodes.
             for rate, each in zip(shown["heuristic"], counts, strict=False):
                 assert abs(rate - share(each, "heuristic")) < 0.1, f"{environment}: {rate}, {each}"
-            solved = (share(each, "solved", "undecided") for each in counts)
-            shown["upper bound"] = with_extrapolation(*solved)
+            shown["upper bound"] = upper_bound(environment)
+        rows[environment] = shown
+    return rows
+
+
+def reference_lines(studies):
+    """Return the texts with numbers that docs/findings/reference-lines.md must contain."""
+    rows, texts = rates_by_task(studies), []
+    for environment, shown in rows.items():
         texts.append(f"| {environment} | | | | |")
         texts += [line(name, rates) for name, rates in shown.items()]
-        rows[environment] = shown
-    return [*texts, *answer(rows), *learned(studies), *mountain_car(studies, rows["MountainCar"], known)]
+    return [*texts, *answer(rows), *learned(studies), *mountain_car(studies, rows["MountainCar"], bounds())]
 
 
 def answer(rows):

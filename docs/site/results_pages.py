@@ -5,8 +5,10 @@ For each page a function computes, from the results table, the texts that the pa
 
 import re
 from collections import defaultdict
+from functools import partial
 from statistics import fmean
 
+import results_lines
 import results_texts
 from results_numbers import ENVIRONMENTS, METRICS, bootstrap_interval, cube_root, holm, sign_flip_p, t_interval
 from results_words import CLEAN, FF, NAMES, Near, Pattern, about, fill, fixed, spread, triple
@@ -37,7 +39,10 @@ def headline(studies):
 
 
 def by_task(studies, study, seeds, methods=FF):
-    """Return the rows of a table of methods and tasks. A row of the paper's numbers follows each method's row."""
+    """Return the rows of a table of methods and tasks, with reference lines.
+
+    A row of the paper's numbers follows each method's row.
+    """
     lines = []
     for name, method in methods.items():
         cells, papers = [], []
@@ -45,7 +50,7 @@ def by_task(studies, study, seeds, methods=FF):
             cells.append(triple(by_seed(studies, study, task, method, seeds)))
             papers.append(" / ".join(fixed(studies.paper(task, method, metric)[0], 0) for metric in METRICS))
         lines += [f"| {NAMES[name]} | " + " | ".join(cells) + " |", "| (paper) | " + " | ".join(papers) + " |"]
-    return lines
+    return lines + results_lines.task_rows(studies)
 
 
 def gains(studies, study, method, seeds, tasks=ENVIRONMENTS, **wanted):
@@ -78,7 +83,7 @@ def readme(studies):
         f"{tied} of {grid} A2C configurations reach 100 % on R",
         f"A2C's average Extrapolation varies from {fixed(low)} to {fixed(high)}.",
     ]
-    return texts
+    return texts + results_lines.average_row(studies)
 
 
 # For the beginning of each row: the study's name, and the number of planned cells if some cells are missing.
@@ -94,7 +99,7 @@ STUDIES = {
     "[heuristic] |": ("heuristic", None),
     "[references] |": ("references", None),
     "[contexts] |": ("contexts", 400),
-    "[changes] |": ("changes", 36),
+    "[changes] |": ("changes", 42),
     "locomotion-rate |": ("locomotion-rate", None),
     "classic |": ("classic", 72),
 }
@@ -143,6 +148,7 @@ def results(studies):
     share = f"all {selected}" if of["classic-ff"] == selected else f"{of['classic-ff']} of the {selected}"
     return [
         *texts,
+        *results_lines.average_row(studies),
         f"This folder has the {of['beyond/confirm-2']} policies of beyond/confirm-2",
         f"{share} selected configurations of classic-ff",
         f"classic-rc: {missing['classic-rc']} cells",
@@ -211,7 +217,7 @@ def classic_ff(studies):
         fill("and {:.0f} and {:.0f} points above it in Interpolation and Extrapolation", *others),
         f"A2C's Interpolation falls from {fixed(rows['a2c'][0][1][0], 0)} to {fixed(fmean(rows['a2c'][1][1]), 0)} %",
     ]
-    return texts
+    return texts + results_lines.average_row(studies)
 
 
 def acrobot(studies):
@@ -241,6 +247,7 @@ def acrobot(studies):
     texts.append(f"| the paper, trained on D | | | | {best} | | | | |")
     texts.append(f"| the paper, trained on R | | | | | | {on_r} | | |")
     texts.append(f"reports a success rate of {best} % for A2C on Acrobot")
+    texts.append(results_lines.both_rules_row(studies))
     return texts + results_texts.acrobot(studies)
 
 
@@ -262,6 +269,7 @@ def pendulum(studies):
 
         row = [interval(early), interval(end["D"]), fixed(fmean(end["R"])), interval(end["E"])]
         texts.append(f"{text} " + " | ".join(row) + " |")
+    texts += results_lines.version_rows(studies, "Pendulum", "| ", "D")
     return texts + results_texts.pendulum(studies)
 
 
@@ -292,6 +300,7 @@ def cart_pole(studies):
             on_e = [cell.success("E", after) for cell in cells]
             row.append(fill("{:.1f} [{:.0f}, {:.0f}]", fmean(on_e), *bootstrap_interval(on_e)))
         texts.append("| " + " | ".join(row) + " |")
+    texts += results_lines.version_rows(studies, "CartPole", "| | | ", "DRE")
     return texts + results_texts.cart_pole(studies)
 
 
@@ -421,6 +430,9 @@ def recurrent(studies):
     for name, method in on_e.items():
         row = [one_seed(studies, task, method, trained_on="E") for task in ENVIRONMENTS]
         texts.append(f"| {name} | " + " | ".join(row) + " |")
+    texts += results_lines.task_rows(studies, rule="text", mean=True)
+    texts += results_lines.task_rows(studies, 1, "text")
+    texts += results_lines.task_rows(studies, 1, "text", places=results_lines.TESTS)
     done, _ = studies.planned("classic-rc")
     return [*texts, f"**{done} of 360 cells**"]
 
@@ -468,7 +480,7 @@ def rl2(studies):
             for task in ("CartPole", "Pendulum"):
                 row += [one_seed(studies, task, method), papers(studies, task, method)]
             texts.append(f"| {label}{trials} | " + " | ".join(row) + " |")
-    return texts
+    return texts + results_lines.trial_rows(studies)
 
 
 def locomotion(studies):
@@ -574,4 +586,4 @@ def beyond(studies):
         means, least, tasks = search_row(studies, cells)
         label = f"{decay or noise:g} | " if decay or noise else "| neither | "
         texts.append(label + " | ".join([*map(fixed, means), fixed(least), *tasks]) + " |")
-    return texts
+    return texts + results_lines.search_rows(studies, partial(margin, studies))

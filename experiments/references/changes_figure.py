@@ -15,7 +15,8 @@ TESTS = {"R": "no change", "changing": "change after\n100 steps", "earlier": "ch
 
 def main():
     results = perturb.read_results("results/results.parquet")
-    results = results[(results.study == "changes") & (results.trained_on == "changing")]
+    results = results[results.study == "changes"]
+    heuristic, results = results[results.algorithm == "heuristic"], results[results.trained_on == "changing"]
     tasks = ["CartPole", "Pendulum"]
     figure, panels = plt.subplots(1, len(tasks), figsize=(7, 3), sharey=True, layout="constrained")
     for panel, task in zip(panels, tasks, strict=True):
@@ -27,11 +28,13 @@ def main():
             line = panel.plot(places, [each.mean() for each in percents], "_-", markersize=12, label=name)[0]
             for place, each in zip(places, percents, strict=True):
                 panel.plot([place] * len(each), each, ".", color=line.get_color())
+        rules = heuristic[heuristic.environment == task].groupby("tested_on").success_percent.mean()
+        panel.plot(range(len(TESTS)), rules[list(TESTS)], "--", color="grey", linewidth=1, label="heuristic policy")
         panel.set_xticks(range(len(TESTS)), TESTS.values())
         panel.set_title(task)
         panel.grid(axis="y", alpha=0.3)
     panels[0].set_ylabel("success, %")
-    panels[-1].legend(frameon=False)
+    panels[0].legend(frameon=False, loc="lower left")
     figure.savefig("results/figures/changing-physics.svg", metadata={"Date": None})
 
 

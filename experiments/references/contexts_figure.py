@@ -1,4 +1,4 @@
-"""Draw results/figures/training-contexts.svg: success over the number of training contexts.
+"""Draw results/figures/training-contexts.svg: success over the number of training contexts, with reference lines.
 
 Usage: python experiments/references/contexts_figure.py, with the Python package and matplotlib, in the project's
 folder.
@@ -7,21 +7,24 @@ folder.
 import matplotlib
 import matplotlib.pyplot as plt
 import perturb
+import reference_rates
+from matplotlib.lines import Line2D
 
 matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"})  # the same bytes at each run
 
 TASKS = ("CartPole", "Pendulum", "Acrobot", "MountainCar")
 ALGORITHMS = {"ppo": "PPO", "a2c": "A2C"}
 COUNTS = (1, 4, 16, 64, 256)
-TESTS = {"own": "the contexts of the training", "R": "R", "E": "E"}
+TESTS = {"own": "tested on the contexts of the training", "R": "tested on R", "E": "tested on E"}
 
 
 def main():
-    results = perturb.read_results("results/results.parquet")
-    results = results[(results.study == "contexts") & (results.seed <= 35)]
+    table = perturb.read_results("results/results.parquet")
+    results = table[(table.study == "contexts") & (table.seed <= 35)]
     figure, panels = plt.subplots(
         len(ALGORITHMS), len(TASKS), figsize=(9, 4.5), sharex=True, sharey=True, layout="constrained"
     )
+    lines = {}
     for row, (algorithm, name) in zip(panels, ALGORITHMS.items(), strict=True):
         for panel, task in zip(row, TASKS, strict=True):
             rows = results[(results.environment == task) & (results.algorithm == algorithm)]
@@ -32,9 +35,12 @@ def main():
                     chosen = rows[(rows.trained_on == own) & (rows.tested_on == (own if test == "own" else test))]
                     columns.append(chosen.success_percent)
                 means = [column.mean() for column in columns]
-                line = panel.plot(COUNTS, means, ".-", label=label)[0]
+                line = panel.plot(COUNTS, means, ".-")[0]
+                lines[label] = line
                 low, high = ([getattr(column, end)() for column in columns] for end in ("min", "max"))
                 panel.fill_between(COUNTS, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+                if test != "own":
+                    reference_rates.draw(panel, table, task, test, line.get_color())
             panel.set_xscale("log", base=4)
             panel.set_xticks(COUNTS, COUNTS)
             panel.grid(alpha=0.3)
@@ -42,7 +48,10 @@ def main():
         row[0].set_ylabel("success, %")
     for panel in panels[-1]:
         panel.set_xlabel("contexts")
-    panels[0][-1].legend(frameon=False, fontsize=8)
+    for label, style in reference_rates.STYLES.items():
+        # A reference line has the colour of its test.
+        lines[label] = Line2D([], [], color=reference_rates.GREY, linestyle=style)
+    figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(lines), frameon=False, fontsize=8)
     figure.savefig("results/figures/training-contexts.svg", metadata={"Date": None})
 
 

@@ -1,11 +1,13 @@
-"""Test PPO policies with one, some or all parameters outside the intervals of R.
+"""Test PPO policies and heuristic policies with one, some or all parameters outside the intervals of R.
 
 Usage: python experiments/references/one_factor.py > experiments/references/one_factor.csv, with the Python package, in
 the project's folder; some minutes
 
-The policies are those of the study beyond/confirm-2 in results/policies: five seeds trained on D and five trained on R.
-Each parameter is drawn from its interval of R, from the lower or from the upper interval of E. Every combination is
-tested with each policy. The column `parameters` lists the choice for each parameter in the catalogue's order.
+The PPO policies are those of the study beyond/confirm-2 in results/policies: five seeds trained on D and five trained
+on R. The heuristic policy of each task, which is not trained, is tested with the same five seeds. Each parameter is
+drawn from its interval of R, from the lower or from the upper interval of E. Every combination is tested with each
+policy. The column `parameters` lists the choice for each parameter in the catalogue's order. The column `trained_on` is
+empty for heuristic policies.
 """
 
 import csv
@@ -16,7 +18,12 @@ import perturb
 
 TASKS = ("CartPole", "MountainCar", "Acrobot", "Pendulum")
 SEEDS = range(7, 12)
-CONFIGURATION = "9bd6546b"
+# The name of a policy's file by its training version. A heuristic policy has the version "".
+NAMES = {
+    "D": "{task}-ppo-ff-D-9bd6546b-s{seed}",
+    "R": "{task}-ppo-ff-R-9bd6546b-s{seed}",
+    "": "{task}-heuristic-ff-D-d3af88ff-s7",
+}
 EPISODES = 200
 
 
@@ -43,10 +50,9 @@ def main():
     rows.writerow(["environment", "trained_on", "seed", "parameters", "episodes", "successes"])
     for task in TASKS:
         tested = sets(catalogue[task])
-        for trained, seed in itertools.product("DR", SEEDS):
-            policy = perturb.load_policy(
-                f"results/policies/{task}-ppo-ff-{trained}-{CONFIGURATION}-s{seed}.safetensors"
-            )
+        for trained, seed in itertools.product(NAMES, SEEDS):
+            name = NAMES[trained].format(task=task, seed=seed)
+            policy = perturb.load_policy(f"results/policies/{name}.safetensors")
             assessment = perturb.evaluate(
                 policy,
                 task,
