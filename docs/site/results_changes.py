@@ -1,21 +1,13 @@
 """The numbers of docs/findings/changing-physics.md, from the results table."""
 
-import math
 from statistics import fmean
 
+from results_numbers import wilson
 from results_words import fill, fixed, spread
 
 METHODS = {"PPO FF": ("ppo", "ff"), "PPO RC": ("ppo", "rc"), "RL²-PPO RC": ("rl2-ppo", "rc")}
 TESTS = ("R", "changing", "earlier")
 SEEDS = 3
-Z = 1.959963984540054  # of a 95 % interval
-
-
-def wilson(percent, n):
-    """Return the 95 % Wilson interval of a success rate in `n` episodes, %."""
-    rate = percent / 100
-    middle, width = rate + Z**2 / (2 * n), Z * math.sqrt(rate * (1 - rate) / n + Z**2 / (4 * n**2))
-    return [100 * (middle + sign * width) / (1 + Z**2 / n) for sign in (-1, 1)]
 
 
 def changing_physics(studies):

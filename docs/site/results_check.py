@@ -16,13 +16,14 @@ import results_changes
 import results_contexts
 import results_factors
 import results_given
+import results_intervals
 import results_lines
 import results_pages
 import results_paper
-from results_numbers import Studies
+import results_stability
+from results_numbers import read_studies
 from results_words import Near, Pattern
 
-TABLE = Path("results/results.parquet")
 POLICIES = Path("results/policies")
 MAX_FILES = 120
 MAX_BYTES = 15_000_000
@@ -35,6 +36,7 @@ PAGES = {
     "docs/findings/acrobot-steps.md": results_pages.acrobot,
     "docs/findings/beyond.md": results_pages.beyond,
     "docs/findings/cart-pole-ties.md": results_pages.cart_pole,
+    "docs/findings/intervals.md": results_intervals.intervals,
     "docs/findings/locomotion.md": results_pages.locomotion,
     "docs/findings/one-factor.md": results_factors.one_factor,
     "docs/findings/paper-claims.md": results_pages.claims,
@@ -43,6 +45,7 @@ PAGES = {
     "docs/findings/recurrent.md": results_pages.recurrent,
     "docs/findings/reference-lines.md": results_lines.reference_lines,
     "docs/findings/rl2-trials.md": results_pages.rl2,
+    "docs/findings/stability.md": results_stability.stability,
     "docs/findings/training-contexts.md": results_contexts.training_contexts,
 }
 # The part of README.md that has results: its first heading, and the first heading after it.
@@ -85,7 +88,7 @@ def check_page(page, studies):
     text = prose(page)
     covered = [False] * len(text)
     faults = []
-    for claim in PAGES[page](studies):
+    for claim in PAGES[page](studies) + results_intervals.sentences(page, studies):
         near = claim if isinstance(claim, Near) else Near(getattr(claim, "expression", claim), [], 0)
         expected = re.sub(r"\]\([^)]*\)", "]", plain(near.text))
         found = list(re.finditer(claim.expression if isinstance(claim, Pattern) else pattern(expected), text))
@@ -173,14 +176,12 @@ def main():
     if shutil.which("perturb", path=programs) is None:
         sys.exit(f"{programs} has no program perturb: run make build")
     pages = pages or list(PAGES)
-    frame = perturb.read_results(TABLE)
-    rows = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    studies = Studies(rows)
+    frame, studies = read_studies()
     faults = [fault for page in pages for fault in check_page(page, studies)]
     faults += check_policies(frame) + check_files() + check_commands(pages, programs)
     for fault in faults:
         print(fault, file=sys.stderr)
-    print(f"{len(pages)} pages, {len(rows)} rows, {len(faults)} faults")
+    print(f"{len(pages)} pages, {len(frame)} rows, {len(faults)} faults")
     sys.exit(1 if faults else 0)
 
 

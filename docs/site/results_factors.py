@@ -11,7 +11,7 @@ from results_words import fill, fixed, spread
 RATES_FILE = Path("experiments/references/one_factor.csv")
 REGIONS = ("low", "R", "high")
 # The column "trained on" of the page's table by that of the file.
-POLICIES = {"D": "D", "R": "R", "": "heuristic policy"}
+POLICIES = {"D": "D", "R": "R", "": "none (heuristic)"}
 
 
 def rates():
@@ -97,7 +97,7 @@ def comparisons(found, named):
             "that of the heuristic policy from {:.0f} to {:.0f} %",
             *(mean["Acrobot", "", ("R", region, "R")] for region in ("R", "high")),
         ),
-        fill("the heuristic policy solves {:.1f} % of them, and otherwise none", weak["low"]),
+        fill("the heuristic policy solves {:.1f} % of them", weak["low"]),
         fill("a mean that is {:.1f} points higher", gain),
         fill("interval of {:.1f} to {:.1f} points", low, high),
         fill("no mean of the table by more than {:.1f} points", max(gains)),

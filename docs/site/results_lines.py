@@ -113,8 +113,10 @@ def task_rows(studies, digits=0, rule="code", between=" / ", places=METRIC_PLACE
 def average_row(studies):
     """Return the row `heuristic` of a table of four-task averages, and its lead over the paper's A2C."""
     means = averages(studies)
-    lead = means[3] - studies.paper_mean(FF["a2c"], "Extrapolation")
-    return [f"| heuristic | | {joined(means)} |", fill("{:.1f} points above that of the paper's A2C", lead)]
+    papers = [studies.paper_mean(FF["a2c"], metric) for metric in METRICS]
+    lead = [means[place] - paper for place, paper in zip(METRIC_PLACES, papers, strict=True)]
+    text = "{:.1f} points lower in Default, {:.1f} lower in Interpolation and {:.1f} higher in Extrapolation"
+    return [f"| heuristic | | {joined(means)} |", fill(text, -lead[0], -lead[1], lead[2])]
 
 
 def version_rows(studies, environment, start, early):
@@ -148,13 +150,18 @@ def trial_rows(studies):
     return texts
 
 
-def search_rows(studies, margin):
-    """Return the rows of the tables of docs/findings/beyond.md. `margin` computes a margin from three averages."""
+def margin(studies, numbers):
+    """Return the least difference of the metrics from the averages of the paper's feed-forward A2C."""
+    return min(number - studies.paper_mean(FF["a2c"], metric) for number, metric in zip(numbers, METRICS, strict=True))
+
+
+def search_rows(studies):
+    """Return the rows of the tables of docs/findings/beyond.md."""
     rows = [f"| {task}, heuristic | {joined(heuristic(studies, task))} |" for task in ENVIRONMENTS]
     limits = {task: upper_bound(task) for task in ENVIRONMENTS}
     rows += [f"| {task}, upper bound | {joined(rates)} |" for task, rates in limits.items() if rates]
     means = averages(studies)
-    fields = [joined(means), fixed(margin([means[place] for place in METRIC_PLACES]))]
+    fields = [joined(means), fixed(margin(studies, [means[place] for place in METRIC_PLACES]))]
     tasks = [joined(heuristic(studies, task), 0, "/") for task in ENVIRONMENTS]
     last = " | ".join([*fields, *tasks])
     lead = average_row(studies)[1]
@@ -242,7 +249,6 @@ def learned(studies):
             for observed, label in OBSERVED.items():
                 cells = studies.finished("references", environment=environment, algorithm=algorithm, observe=observed)
                 assert len(cells) == LEARNED_SEEDS, f"{environment}, {algorithm}, {observed}: {len(cells)} seeds"
-                cells.sort(key=lambda cell: cell.seed)
                 found[observed] = {version: [cell.success(version) for cell in cells] for version in "DRE"}
                 row = " | ".join(map(spread, found[observed].values()))
                 texts.append(f"| {environment}, {NAMES[algorithm]} | {label} | {row} |")

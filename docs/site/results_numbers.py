@@ -9,6 +9,9 @@ from collections import defaultdict
 from pathlib import Path
 from statistics import fmean
 
+import perturb
+
+TABLE = Path("results/results.parquet")
 PAPER = Path("crates/records/data/paper_results.csv")
 ENVIRONMENTS = ("CartPole", "Pendulum", "Acrobot", "MountainCar")
 METRICS = ("Default", "Interpolation", "Extrapolation")
@@ -16,6 +19,7 @@ METRICS = ("Default", "Interpolation", "Extrapolation")
 # choices. The report uses the same two numbers.
 CHOICES = 100_000
 EXACT_PAIRS = 16
+Z = 1.959963984540054  # of a 95 % interval
 
 
 def cube_root(product):
@@ -89,13 +93,14 @@ class Studies:
             self.paper_rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
 
     def finished(self, study, **wanted):
-        """Return the finished cells of a study whose settings or attributes have the values `wanted`."""
+        """Return the finished cells of a study whose settings or attributes are `wanted`, ordered by seed."""
 
         def fits(cell, name, value):
             return value == (getattr(cell, name) if hasattr(cell, name) else cell.settings.get(name))
 
         cells = [cell for cell in self.cells if cell.study == study and not cell.failed]
-        return [cell for cell in cells if all(fits(cell, *pair) for pair in wanted.items())]
+        chosen = (cell for cell in cells if all(fits(cell, *pair) for pair in wanted.items()))
+        return sorted(chosen, key=lambda cell: cell.seed)
 
     def planned(self, study):
         """Return the number of finished cells and the number of failed cells."""
@@ -150,6 +155,12 @@ class Studies:
         return [(fmean(numbers), min(numbers), max(numbers)) for numbers in every]
 
 
+def read_studies():
+    """Return the results table as a DataFrame and as studies."""
+    frame = perturb.read_results(TABLE)
+    return frame, Studies(frame.astype(object).where(frame.notna(), None).to_dict("records"))
+
+
 def quantile_t(freedom, probability=0.975):
     """Return the quantile of Student's t distribution, by bisection of its integral."""
     constant = math.exp(math.lgamma((freedom + 1) / 2) - math.lgamma(freedom / 2)) / math.sqrt(freedom * math.pi)
@@ -195,6 +206,13 @@ def bootstrap_interval(runs):
         return means[low] + (place - low) * (means[min(low + 1, last)] - means[low])
 
     return percentile(0.025), percentile(0.975)
+
+
+def wilson(percent, n):
+    """Return the 95 % Wilson interval of a success rate in `n` episodes, %."""
+    rate = percent / 100
+    middle, width = rate + Z**2 / (2 * n), Z * math.sqrt(rate * (1 - rate) / n + Z**2 / (4 * n**2))
+    return [100 * (middle + sign * width) / (1 + Z**2 / n) for sign in (-1, 1)]
 
 
 def sign_flip_p(differences):

@@ -1,17 +1,13 @@
 """The numbers of docs/findings/paper-items.md, from the results table."""
 
-import math
 from collections import Counter, defaultdict
-from statistics import fmean
 
-from results_numbers import ENVIRONMENTS, std
-from results_words import CLEAN, FF, NAMES, fill, spread
+from results_numbers import ENVIRONMENTS
 
 # The studies that repeat the paper's methods with seeds that did not select a configuration.
 STUDIES = ("classic-ff", "classic-rc", "questions/findings", "beyond/confirm-2", "locomotion")
 SELECTION_SEED = 1
 KINDS = ("five", "three", "fewer", "none")
-NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
 
 
 def seeds(studies):
@@ -56,44 +52,4 @@ def paper_items(studies):
         f"The paper has {len(known)} numbers for single environments",
         f"For {five} of them, studies of this project have at least five seeds, and for {none} of them no seed",
     ]
-    return [*texts, *answer, *stability(studies)]
-
-
-def stability(studies):
-    """Return the rows and counts of the section on training with random physics."""
-    texts, gains = [], {}
-    steadier = steadier_on_d = 0
-    for task in ENVIRONMENTS:
-        for name in FF:
-            runs = {}
-            for version in "DR":
-                cells = studies.finished("questions/findings", environment=task, algorithm=name, trained_on=version)
-                runs[version] = sorted((cell for cell in cells if cell.seed in CLEAN), key=lambda cell: cell.seed)
-                assert len(runs[version]) == len(CLEAN), f"{task}, {name}, {version}: {len(runs[version])} seeds"
-            on_d, on_r, on_d_after_r = (
-                [cell.success(tested) for cell in runs[trained]] for trained, tested in ("DD", "RR", "RD")
-            )
-            if not any(on_d):
-                continue
-            for runs in (on_d, on_r, on_d_after_r):
-                assert std(runs) <= 30 or max(runs) - min(runs) > 50, f"{task}, {name}: {runs}"
-            steadier += std(on_r) < std(on_d)
-            steadier_on_d += std(on_d_after_r) < std(on_d)
-            gains[NAMES[name], task] = fmean(on_d_after_r) - fmean(on_d)
-            row = [spread(on_d), spread(on_r), spread(on_d_after_r)]
-            texts.append(f"| {task} | {NAMES[name]} | " + " | ".join(row) + " |")
-    pairs = NUMBER_WORDS[len(gains)]
-    left_out = len(ENVIRONMENTS) * len(FF) - len(gains)
-    tail = sum(math.comb(len(gains), count) for count in range(steadier, len(gains) + 1)) / 2 ** len(gains)
-    better = NUMBER_WORDS[sum(gain > 0 for gain in gains.values())]
-    most, least = max(gains, key=gains.get), min(gains, key=gains.get)
-    return [
-        *texts,
-        f"{NUMBER_WORDS[left_out].capitalize()} of the {len(ENVIRONMENTS) * len(FF)} pairs of task and algorithm",
-        fill(f"at least {NUMBER_WORDS[steadier]} of {pairs} would have a probability of {{:.0f}} %", 100 * tail),
-        f"In {NUMBER_WORDS[steadier]} of the {pairs} pairs, the results on R vary less than those on D",
-        f"those trained on R vary less in {NUMBER_WORDS[steadier_on_d]} of the {pairs} pairs",
-        f"In {better} of the {pairs} pairs, policies trained on R have a higher",
-        fill("largest gain is {:.1f} points ({} on {})", gains[most], *most),
-        fill("largest loss is {:.1f} points ({} on {})", -gains[least], *least),
-    ]
+    return [*texts, *answer]

@@ -66,6 +66,12 @@ def triple(metrics):
     return " / ".join(spread(numbers, 0) for numbers in metrics)
 
 
+def listed(names):
+    """Return names as text: "A, B and C", or "none" without names."""
+    *others, last = names or ["none"]
+    return f"{', '.join(others)} and {last}" if others else last
+
+
 def about(number):
     """Return a number rounded to thousands, or below 10 000 to hundreds. A space separates the thousands."""
     unit = 1000 if number >= 10_000 else 100

@@ -8,9 +8,8 @@ from statistics import fmean
 
 import matplotlib
 import matplotlib.pyplot as plt
-import perturb
 import reference_rates
-from results_numbers import ENVIRONMENTS, METRICS, Studies
+from results_numbers import ENVIRONMENTS, METRICS, read_studies
 from results_pages import by_seed
 from results_words import CLEAN, FF, NAMES
 
@@ -18,8 +17,7 @@ matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"}) 
 
 
 def main():
-    frame = perturb.read_results("results/results.parquet")
-    studies = Studies(frame.astype(object).where(frame.notna(), None).to_dict("records"))
+    _, studies = read_studies()
     figure, panels = plt.subplots(
         len(METRICS), len(ENVIRONMENTS), figsize=(9, 6.5), sharex=True, sharey=True, layout="constrained"
     )
@@ -40,7 +38,7 @@ def main():
                 )
         for row, metric in enumerate(METRICS):
             panel = panels[row][column]
-            reference_rates.draw_metric(panel, frame, task, metric)
+            reference_rates.draw(panel, studies, task, metric)
             panel.set_ylim(-5, 105)
             panel.set_xlim(-0.6, len(FF) - 0.4)
             panel.set_xticks(range(len(FF)), [NAMES[name].replace("-", "-\n") for name in FF], fontsize=8)

@@ -1,14 +1,15 @@
 """Draw results/figures/training-contexts.svg: success over the number of training contexts, with reference lines.
 
-Usage: python experiments/references/contexts_figure.py, with the Python package and matplotlib, in the project's
-folder.
+Usage: PYTHONPATH=docs/site python experiments/references/contexts_figure.py, with the Python package and matplotlib, in
+the project's folder.
 """
 
 import matplotlib
 import matplotlib.pyplot as plt
-import perturb
 import reference_rates
 from matplotlib.lines import Line2D
+from results_contexts import SEED_COUNT
+from results_numbers import read_studies
 
 matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"})  # the same bytes at each run
 
@@ -19,8 +20,8 @@ TESTS = {"own": "tested on the contexts of the training", "R": "tested on R", "E
 
 
 def main():
-    table = perturb.read_results("results/results.parquet")
-    results = table[(table.study == "contexts") & (table.seed <= 35)]
+    table, studies = read_studies()
+    results = table[table.study == "contexts"]
     figure, panels = plt.subplots(
         len(ALGORITHMS), len(TASKS), figsize=(9, 4.5), sharex=True, sharey=True, layout="constrained"
     )
@@ -33,6 +34,7 @@ def main():
                 for count in COUNTS:
                     own = f"contexts{count}"
                     chosen = rows[(rows.trained_on == own) & (rows.tested_on == (own if test == "own" else test))]
+                    assert len(chosen) == SEED_COUNT, f"{len(chosen)} tests of {algorithm} on {own} of {task}"
                     columns.append(chosen.success_percent)
                 means = [column.mean() for column in columns]
                 line = panel.plot(COUNTS, means, ".-")[0]
@@ -40,7 +42,7 @@ def main():
                 low, high = ([getattr(column, end)() for column in columns] for end in ("min", "max"))
                 panel.fill_between(COUNTS, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
                 if test != "own":
-                    reference_rates.draw(panel, table, task, test, line.get_color())
+                    reference_rates.draw(panel, studies, task, test, line.get_color())
             panel.set_xscale("log", base=4)
             panel.set_xticks(COUNTS, COUNTS)
             panel.grid(alpha=0.3)

@@ -6,9 +6,8 @@ matplotlib, in the project's folder.
 
 import matplotlib
 import matplotlib.pyplot as plt
-import perturb
 from results_lines import rates_by_task
-from results_numbers import Studies
+from results_numbers import read_studies
 
 matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"})  # the same bytes at each run
 
@@ -24,8 +23,8 @@ MARKERS = {
 
 
 def main():
-    frame = perturb.read_results("results/results.parquet")
-    found = rates_by_task(Studies(frame.astype(object).where(frame.notna(), None).to_dict("records")))
+    _, studies = read_studies()
+    found = rates_by_task(studies)
     figure, panels = plt.subplots(1, len(found), figsize=(9, 3.4), sharey=True, layout="constrained")
     lines = {}
     for panel, (task, shown) in zip(panels, found.items(), strict=True):

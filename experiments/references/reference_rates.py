@@ -3,55 +3,23 @@
 The scripts that draw figures import this module. docs/findings/reference-lines.md explains the lines.
 """
 
-import csv
-from pathlib import Path
+import results_lines
 
-BOUNDS = Path("experiments/references/upper_bound.csv")
-# A grey that differs from the colours of other lines.
+# Shades of grey that are visible on white and beside the colours of other lines.
 GREY = "0.35"
 STYLES = {"heuristic policy": "--", "upper bound": ":"}
+# The index of each version and metric in the lists of results_lines.
+PLACES = {"D": 0, "R": 1, "E": 2, "Default": 0, "Interpolation": 1, "Extrapolation": 3}
 
 
-def heuristic(results, task, version):
-    """Return the mean success of the heuristic policy over all seeds, %. `results` is the results table."""
-    rows = results[(results.study == "heuristic") & (results.algorithm == "heuristic")]
-    rows = rows[(rows.environment == task) & (rows.tested_on == version)]
-    assert len(rows) == 5, f"the table has {len(rows)} tests of the heuristic policy on {version} of {task}"
-    return rows.success_percent.mean()
+def draw(panel, studies, task, name, color=GREY):
+    """Draw the known reference lines of a task across a panel of success in %. Return them by label.
 
-
-def upper_bound(task, version):
-    """Return the share of episodes that can be solved, %. None if it is unknown."""
-    with BOUNDS.open() as file:
-        for row in csv.DictReader(file):
-            if (row["environment"], row["version"], row["part"]) == (task, version, "all"):
-                return 100 * (int(row["solved"]) + int(row["undecided"])) / int(row["episodes"])
-    return None
-
-
-def both(results, task, version):
-    """Return the success of both reference lines, %, by label."""
-    return {"heuristic policy": heuristic(results, task, version), "upper bound": upper_bound(task, version)}
-
-
-def draw_rates(panel, rates, color):
+    `name` is the version of the tests, or Default, Interpolation or Extrapolation.
+    """
+    known = {"heuristic policy": results_lines.heuristic(studies, task), "upper bound": results_lines.upper_bound(task)}
     return {
-        label: panel.axhline(rate, color=color, linestyle=STYLES[label], linewidth=1.2, label=label)
-        for label, rate in rates.items()
-        if rate is not None
+        label: panel.axhline(rates[PLACES[name]], color=color, linestyle=STYLES[label], linewidth=1.2, label=label)
+        for label, rates in known.items()
+        if rates is not None
     }
-
-
-def draw(panel, results, task, version, color=GREY):
-    """Draw the known reference lines of a task and a version across a panel of success in %. Return them by label."""
-    return draw_rates(panel, both(results, task, version), color)
-
-
-def draw_metric(panel, results, task, metric, color=GREY):
-    """Draw the known reference lines of a task for Default, Interpolation or Extrapolation. Return them by label."""
-    if metric != "Extrapolation":
-        return draw(panel, results, task, {"Default": "D", "Interpolation": "R"}[metric], color)
-    on_r, on_e = (both(results, task, version) for version in "RE")
-    # A reference line does not depend on the training, so success on E counts twice.
-    rates = {label: None if on_r[label] is None else (on_r[label] * on_e[label] ** 2) ** (1 / 3) for label in STYLES}
-    return draw_rates(panel, rates, color)

@@ -1,7 +1,7 @@
 """Draw the figures of success over the training of the studies questions/acrobot, cart-pole and pendulum.
 
-Usage: python experiments/references/training_figures.py, with the Python package and matplotlib, in the project's
-folder. It writes three files to results/figures.
+Usage: PYTHONPATH=docs/site python experiments/references/training_figures.py, with the Python package and matplotlib,
+in the project's folder. It writes three files to results/figures.
 
 Each row of a figure compares the values of a setting. A thick line is the mean of all trainings with a value. A thin
 line is the mean of one configuration over its seeds. All policies were trained on D.
@@ -13,6 +13,7 @@ import matplotlib
 import matplotlib.pyplot as plt
 import perturb
 import reference_rates
+from results_numbers import TABLE, read_studies
 
 matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"})  # the same bytes at each run
 
@@ -51,13 +52,13 @@ FIGURES = {
 }
 
 
-def draw_row(panels, row, task, results, chosen):
+def draw_row(panels, row, task, studies, chosen):
     """Draw a row of panels from the rows `chosen` of the table, and its legend to the right."""
     unknown = set(chosen[row.setting]) - set(row.values)
     assert not unknown, f"{task}: no name for {row.setting} of {unknown}"
     for panel, version in zip(panels, "DRE", strict=True):
         # The reference lines lie below the others.
-        lines = reference_rates.draw(panel, results, task, version)
+        lines = reference_rates.draw(panel, studies, task, version)
         tests = chosen[chosen.tested_on == version]
         for place, (value, label) in enumerate(row.values.items()):
             rows = tests[tests[row.setting] == value]
@@ -76,13 +77,13 @@ def draw_row(panels, row, task, results, chosen):
     panels[-1].legend(handles, labels, loc="center left", bbox_to_anchor=(1, 0.5), frameon=False, fontsize=8)
 
 
-def draw(name, task, rows, results):
+def draw(name, task, rows, results, studies):
     figure, panels = plt.subplots(
         len(rows), 3, figsize=(9, 2.6 * len(rows)), sharex=True, sharey=True, layout="constrained"
     )
     for row, line in zip(rows, panels, strict=True):
         chosen = results[(results.study == f"questions/{name}") & (results.algorithm == row.algorithm)]
-        draw_row(line, row, task, results, chosen[chosen.trained_on == "D"])
+        draw_row(line, row, task, studies, chosen[chosen.trained_on == "D"])
     for panel, version in zip(panels[0], "DRE", strict=True):
         panel.set_title(f"tested on {version}", fontsize=10)
     for panel in panels[-1]:
@@ -93,12 +94,13 @@ def draw(name, task, rows, results):
 
 def main():
     settings = {row.setting for rows in FIGURES.values() for row in rows}
-    results = perturb.read_results("results/results.parquet", settings=settings)
+    results = perturb.read_results(TABLE, settings=settings)
+    _, studies = read_studies()
     # The last episodes of a training end together, so some trainings have up to five more than the budget.
     results["mark"] = results.after_episodes.clip(upper=EPISODES).astype(float)
     results["configuration"] = results.cell.str.rsplit("-", n=1).str[0]
     for (name, task), rows in FIGURES.items():
-        draw(name, task, rows, results)
+        draw(name, task, rows, results, studies)
 
 
 if __name__ == "__main__":

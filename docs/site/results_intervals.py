@@ -1,0 +1,278 @@
+"""The numbers of docs/findings/intervals.md: how often intervals contain the true mean.
+
+The ten results of a training with ten seeds serve as a population, whose mean is known. The coverage is the probability
+that the interval of n results, drawn from the population with replacement, contains this mean. It is computed from all
+possible samples. Only the coverage over four tasks is computed from random samples. Populations of ten normally
+distributed numbers serve as a control, because the method itself lowers the coverage: a sample may have the same result
+twice.
+"""
+
+import itertools
+import math
+from functools import cache
+from statistics import median
+
+import numpy as np
+from results_contexts import CONTEXT_COUNTS
+from results_numbers import ENVIRONMENTS, quantile_t, wilson
+from results_words import fill, fixed
+
+# The number of results in a population.
+POPULATION = 10
+SAMPLES = {3: "three", 5: "five", 10: "ten"}
+# The number of random samples of an interval over several tasks, whose possible samples are too many.
+DRAWS = 20_000
+# The number of normally distributed populations.
+CONTROLS = 100
+# The true coverage of t intervals of normally distributed results, and that of bootstrap intervals as in
+# docs/reports.md, %.
+NORMAL = {"t": {3: 95, 5: 95, 10: 95}, "bootstrap": {3: 73, 5: 84}}
+LABELS = {
+    ("t", "success"): "t, success",
+    ("t", "difference"): "t, difference",
+    ("t", "over_tasks"): "t, difference over four tasks",
+    ("bootstrap", "success"): "bootstrap, success",
+}
+# True success rates, as fractions, and numbers of episodes for which Wilson intervals are computed.
+RATES = (0.01, 0.05, 0.1, 0.3, 0.5, 0.7, 0.9, 0.95, 0.99)
+HIGH_RATES = (0.995, 0.999, 0.9995)
+EPISODES = (200, 1_000, 3_000)
+# Sentences have the coverage of populations with equal results if it is lower by more than this number of points.
+NOTABLE_DIFFERENCE = 5
+# The sentences on coverage that a page must have: kind of interval, kind of result, number of seeds.
+PAGES = {
+    "acrobot-steps": [("bootstrap", "success", 5)],
+    "beyond": [("t", "success", 5)],
+    "cart-pole-ties": [("bootstrap", "success", 5)],
+    "changing-physics": [("t", "success", 3)],
+    "classic-ff": [("t", "success", 5), ("t", "over_tasks", 5)],
+    "locomotion": [("t", "success", 3)],
+    "one-factor": [("t", "success", 5)],
+    "paper-claims": [("t", "difference", 5), ("t", "over_tasks", 5), ("t", "over_tasks", 3)],
+    "pendulum-ppo": [("bootstrap", "success", 5)],
+    "recurrent": [("t", "success", 3)],
+    "reference-lines": [("t", "difference", 10)],
+    "rl2-trials": [("t", "success", 3)],
+    "training-contexts": [("t", "difference", 10)],
+}
+
+
+def counts(draws, values):
+    """Return how often each of `values` values can occur in `draws` draws, int [samples, values]."""
+    if values == 1:
+        return np.array([[draws]])
+    parts = [np.insert(counts(draws - first, values - 1), 0, first, axis=1) for first in range(draws + 1)]
+    return np.concatenate(parts)
+
+
+@cache
+def samples(draws, values):
+    """Return all samples as `counts`, and their probabilities with equally likely values, float [samples]."""
+    found = counts(draws, values)
+    factorials = np.array([float(math.factorial(number)) for number in range(draws + 1)])
+    return found, factorials[draws] / factorials[found].prod(axis=1) / float(values) ** draws
+
+
+@cache
+def quantiles(low, high):
+    """Return degrees of freedom from `low` to `high`, and the quantile of Student's t distribution for each."""
+    freedom = np.linspace(low, high, 40)
+    return freedom, np.array([quantile_t(each) for each in freedom])
+
+
+def contains(middle, low, high):
+    """Return whether intervals contain the mean `middle`. Rounding errors do not count."""
+    return (low <= middle + 1e-9) & (middle - 1e-9 <= high)
+
+
+def t_coverage(population, draws):
+    """Return the coverage of the 95 % t interval of `draws` results, %."""
+    found, probability = samples(draws, len(population))
+    means = found @ population / draws
+    squares = np.maximum(found @ population**2 - draws * means**2, 0)
+    half = quantiles(draws - 1, draws)[1][0] * np.sqrt(squares / (draws - 1) / draws)
+    return 100 * probability[contains(population.mean(), means - half, means + half)].sum()
+
+
+def bootstrap_coverage(population, draws):
+    """Return the coverage of the 95 % interval of percentiles of all resamples of `draws` results, %."""
+    found, probability = samples(draws, len(population))
+    resamples, weights = samples(draws, draws)
+    results = np.array([np.repeat(population, row) for row in found])
+    means = results @ resamples.T / draws
+    order = means.argsort(axis=1)
+    means = np.take_along_axis(means, order, axis=1)
+    # The last place of each mean in the sorted list of all draws ** draws resamples.
+    last = np.rint(weights[order] * draws**draws).cumsum(axis=1) - 1
+
+    def percentile(share):
+        place = share * (draws**draws - 1)
+        low, high = (
+            np.take_along_axis(means, (last < step(place)).sum(axis=1)[:, None], axis=1)[:, 0]
+            for step in (math.floor, math.ceil)
+        )
+        return low + (place - math.floor(place)) * (high - low)
+
+    return 100 * probability[contains(population.mean(), percentile(0.025), percentile(0.975))].sum()
+
+
+def over_tasks_coverage(tasks, draws):
+    """Return the coverage of the 95 % t interval of the mean over the populations of several tasks, %.
+
+    The interval is that of `results_numbers.t_interval`, with a quantile that is interpolated.
+    """
+    tasks = np.asarray(tasks)
+    places = np.random.default_rng(1).integers(0, tasks.shape[1], (DRAWS, len(tasks), draws))
+    drawn = np.take_along_axis(tasks[None], places.reshape(DRAWS, len(tasks), -1), axis=2)
+    means, variances = drawn.mean(axis=(1, 2)), drawn.var(axis=2, ddof=1) / draws / len(tasks) ** 2
+    variance, by_freedom = variances.sum(axis=1), (variances**2).sum(axis=1) / (draws - 1)
+    freedom = np.divide(variance**2, by_freedom, out=np.full(DRAWS, float(draws - 1)), where=by_freedom > 0)
+    half = np.interp(freedom, *quantiles(draws - 1, len(tasks) * (draws - 1))) * np.sqrt(variance)
+    return 100 * contains(tasks.mean(), means - half, means + half).mean()
+
+
+def wilson_coverage(rate, episodes):
+    """Return the coverage of the 95 % Wilson interval of a success rate, %, if its true value is `rate`, a fraction."""
+    successes = np.arange(episodes + 1)
+    logs = np.array([math.lgamma(number + 1) for number in successes])
+    probability = np.exp(
+        logs[-1] - logs - logs[::-1] + successes * math.log(rate) + (episodes - successes) * math.log1p(-rate)
+    )
+    ends = np.array([wilson(100 * number / episodes, episodes) for number in successes])
+    return 100 * probability[contains(100 * rate, *ends.T)].sum()
+
+
+def populations(studies):
+    """Return the populations of ten results, by kind.
+
+    The kinds are `success`, the success of a training in a test, `difference`, the difference of two trainings of the
+    same seed, and `over_tasks`, one such difference for each of the four tasks. Successes and differences that are
+    equal for all ten seeds are left out.
+    """
+    rates = {}
+    for study, kinds in (("references", ("parameters", None)), ("contexts", CONTEXT_COUNTS)):
+        for kind, task, algorithm in itertools.product(kinds, ENVIRONMENTS, ("ppo", "a2c")):
+            wanted = {"observe": kind} if study == "references" else {"trained_on": f"contexts{kind}"}
+            cells = studies.finished(study, environment=task, algorithm=algorithm, **wanted)
+            assert len(cells) == POPULATION, f"{study}, {kind}, {task}, {algorithm}: {len(cells)} seeds"
+            for test in "DRE" if study == "references" else (f"contexts{kind}", "R", "E"):
+                rates[study, kind, task, algorithm, test] = np.array([cell.success(test) for cell in cells])
+    pairs = [("references", "parameters", None, test) for test in "DRE"]
+    pairs += [("contexts", count, 1, "R") for count in CONTEXT_COUNTS[1:]]
+    differences = [
+        [
+            rates[study, kind, task, algorithm, test] - rates[study, other, task, algorithm, test]
+            for task in ENVIRONMENTS
+        ]
+        for study, kind, other, test in pairs
+        for algorithm in ("ppo", "a2c")
+    ]
+    return {
+        "success": [each for each in rates.values() if np.ptp(each) > 0],
+        "difference": [each for tasks in differences for each in tasks if np.ptp(each) > 0],
+        "over_tasks": differences,
+    }
+
+
+def half_equal(population):
+    """Return whether at least half of a population's results are equal."""
+    return np.unique(np.round(population, 6), return_counts=True)[1].max() >= POPULATION / 2
+
+
+@cache
+def coverages(studies):
+    """Return the populations by kind of result, and the coverages of each kind of interval by number of results, %."""
+    found = populations(studies)
+    normal = np.random.default_rng(1).normal(size=(CONTROLS, POPULATION))
+    rows = {}
+    for interval, kind in LABELS:
+        coverage = {"t": t_coverage, "bootstrap": bootstrap_coverage}[interval]
+        if kind == "over_tasks":
+            coverage = over_tasks_coverage
+        for number in NORMAL[interval]:
+            rows[interval, kind, number] = [coverage(each, number) for each in found[kind]]
+            if (interval, "control", number) not in rows:
+                rows[interval, "control", number] = [coverage(each, number) for each in normal]
+    return found, rows
+
+
+def estimates(studies, interval, kind, number):
+    """Return the estimated coverages of two groups of populations, %: fewer than half of the results equal, and others.
+
+    An estimate is the median of the group, plus the number of percentage points by which the control falls short of the
+    true coverage for normally distributed results.
+    """
+    found, rows = coverages(studies)
+    short = NORMAL[interval][number] - median(rows[interval, "control", number])
+    equal = [kind != "over_tasks" and half_equal(each) for each in found[kind]]
+    known = rows[interval, kind, number]
+    groups = [[*itertools.compress(known, chosen)] for chosen in ([not each for each in equal], equal)]
+    return [median(group) + short if group else None for group in groups]
+
+
+def sentences(page, studies):
+    """Return the sentences on coverage that a page of findings must contain."""
+    name = page.removeprefix("docs/findings/").removesuffix(".md")
+    texts = []
+    for interval, kind, number in PAGES.get(name, []):
+        usual, equal = estimates(studies, interval, kind, number)
+        what = {"over_tasks": "over four tasks", "difference": "of a difference", "success": "of a mean"}[kind]
+        label = "bootstrap intervals" if interval == "bootstrap" else "t intervals"
+        text = f"[Such {label} {what}] contain the true mean in some {fixed(usual, 0)} % of the cases"
+        if equal is not None and equal < usual - NOTABLE_DIFFERENCE:
+            text += f", and in some {fixed(equal, 0)} % if half of the results are equal"
+        if kind == "success" and interval == "t":
+            texts.append(
+                f"A 95 % t interval of the mean of {SAMPLES[number]} seeds extends {fixed(width(number))} of these "
+                "standard deviations, which have n in the denominator, to each side."
+            )
+        texts.append(f"{text}.")
+    return texts
+
+
+def width(number):
+    """Return half the length of a 95 % t interval of `number` results, in standard deviations with n as denominator."""
+    return quantile_t(number - 1) / math.sqrt(number - 1)
+
+
+def field(coverage):
+    """Return the median and the lowest of coverages as text."""
+    return fill("{:.0f} ({:.0f})", median(coverage), min(coverage)) if coverage else ""
+
+
+def answer(studies):
+    """Return the texts of the answer."""
+    usual, mean = estimates(studies, "t", "success", 3)
+    _, difference = estimates(studies, "t", "difference", 3)
+    bootstrap, _ = estimates(studies, "bootstrap", "success", 5)
+    return [
+        fill("A t interval does so in some {:.0f} % of the cases", usual),
+        fill("with three seeds, in some {:.0f} % of the cases for a mean, and in some {:.0f} % for", mean, difference),
+        fill("they contain the true mean in some {:.0f} % of the cases", bootstrap),
+    ]
+
+
+def intervals(studies):
+    """Return the texts with numbers that the page must contain."""
+    found, rows = coverages(studies)
+    texts = []
+    for (interval, kind), label in LABELS.items():
+        groups = {"": [True] * len(found[kind])}
+        if kind != "over_tasks":
+            equal = [half_equal(each) for each in found[kind]]
+            groups = {"": [not each for each in equal], ", half of the results equal": equal}
+        for suffix, chosen in groups.items():
+            known = [rows.get((interval, kind, number), []) for number in SAMPLES]
+            fields = [field([*itertools.compress(coverage, chosen)]) for coverage in known]
+            texts.append(f"| {label}{suffix} | {sum(chosen)} | " + " | ".join(fields) + " |")
+    for interval in NORMAL:
+        fields = [field(rows.get((interval, "control", number), [])) for number in SAMPLES]
+        texts.append(f"| {interval}, normal numbers | {CONTROLS} | " + " | ".join(fields) + " |")
+    usual, high = ([wilson_coverage(rate, n) for rate in rates for n in EPISODES] for rates in (RATES, HIGH_RATES))
+    return [
+        *texts,
+        *answer(studies),
+        "| " + " | ".join(fixed(width(number)) for number in SAMPLES) + " |",
+        fill("between {:.0f} and {:.0f} % of the cases if the true rate is between 1 and 99 %", min(usual), max(usual)),
+        fill("between {:.0f} and {:.0f} % if it is between 99.5 and 99.95 %", min(high), max(high)),
+    ]
