@@ -35,7 +35,7 @@ def changing_physics(studies):
     gain = changed["Pendulum", "RL²-PPO RC", "changing"] - changed["Pendulum", "PPO FF", "changing"]
     return [
         *texts,
-        fill("{:.1f} to {:.1f} % of the episodes with a change succeed", min(rates), max(rates)),
+        fill("succeed in {:.1f} to {:.1f} % of the episodes with a change", min(rates), max(rates)),
         fill("RL²-PPO is {:.1f} points better than PPO without memory", gain),
         fill("at least {:.1f} % of the episodes with a change", min(min(rates[1:]) for rates in heuristic.values())),
     ]

@@ -71,6 +71,7 @@ def training_contexts(studies):
         *texts,
         f"the gain with 256 contexts is significant for {listed(significant)}",
         fill("On Pendulum, PPO gains {:.1f} points with 256 contexts and {:.1f} with 64", *on_pendulum),
+        fill("A2C on CartPole improves from {:.1f} to {:.1f} %", *(mean("CartPole", "a2c", n, "E") for n in (1, 256))),
         fill(
             "one context gives {:.1f} % on R with PPO and {:.1f} % with A2C",
             mean("CartPole", "ppo", 1, "R"),

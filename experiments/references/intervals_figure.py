@@ -7,7 +7,7 @@ in the project's folder; a minute
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
-from results_intervals import LABELS, SAMPLES, coverages, half_equal
+from results_intervals import LABELS, SAMPLES, coverages, mostly_equal
 from results_numbers import read_studies
 
 matplotlib.rcParams.update({"svg.hashsalt": "perturb", "svg.fonttype": "none"})  # the same bytes at each run
@@ -19,7 +19,7 @@ def main():
     figure, panels = plt.subplots(1, len(LABELS), figsize=(9, 3), sharey=True, layout="constrained")
     generator = np.random.default_rng(1)
     for panel, ((interval, kind), label) in zip(panels, LABELS.items(), strict=True):
-        equal = np.array([kind != "over_tasks" and half_equal(each) for each in found[kind]])
+        equal = np.array([kind != "over_tasks" and mostly_equal(each) for each in found[kind]])
         # The dots of a column lie side by side, so that more of them are visible.
         offsets = generator.uniform(-0.25, 0.25, len(equal))
         for place, number in enumerate(SAMPLES):
@@ -27,8 +27,8 @@ def main():
             if not len(coverage):
                 continue
             for chosen, color, text in (
-                (~equal, "C0", "fewer than half of the results equal"),
-                (equal, "C1", "half of the results equal"),
+                (~equal, "C0", "at most six equal results"),
+                (equal, "C1", "seven or more equal results"),
             ):
                 panel.plot(place + offsets[chosen], coverage[chosen], ".", color=color, markersize=4, label=text)
         panel.axhline(95, color="0.35", linestyle="--", linewidth=1)
