@@ -101,6 +101,7 @@ GIVEN = {
     "docs/findings/stability.md": [
         # From the experiment file, and from `perturb curves`.
         r"with five seeds \(2 to 6\)",
+        r"EPOpt-PPO generates 60 000 episodes",
         r"Each training has 15 000 episodes, which are divided into 100 parts",
         r"over the 100 parts",
         # Asserted by the script.

@@ -93,6 +93,7 @@ STUDIES = {
     "[questions/pendulum] |": ("questions/pendulum", None),
     "[questions/acrobot] |": ("questions/acrobot", None),
     "[questions/findings] |": ("questions/findings", None),
+    "[questions/stability] |": ("questions/stability", 180),
     "[beyond], [nine studies] |": ("beyond/", None),
     "[locomotion] |": ("locomotion", 72),
     "[heuristic] |": ("heuristic", None),
@@ -103,7 +104,7 @@ STUDIES = {
     "classic |": ("classic", 72),
 }
 HOURS = ("classic-ff", "classic-rc", "locomotion", "questions/acrobot", "questions/cart-pole", "questions/findings")
-HOURS += ("questions/pendulum", "references", "contexts", "beyond/search-*", "beyond/confirm-2")
+HOURS += ("questions/pendulum", "questions/stability", "references", "contexts", "beyond/search-*", "beyond/confirm-2")
 
 
 def named(studies, name):
@@ -152,6 +153,7 @@ def results(studies):
         f"{share} selected configurations of classic-ff",
         f"classic-rc: {missing['classic-rc']} cells",
         f"locomotion: {missing['locomotion']} cells",
+        f"questions/stability: {missing['questions/stability']} cells",
     ]
 
 

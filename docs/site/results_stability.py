@@ -12,8 +12,10 @@ from results_words import CLEAN, FF, NAMES, fill, fixed, spread
 CURVES = Path("results/curves/questions-stability.csv")
 ALGORITHMS = ("a2c", "ppo", "epopt-ppo")
 NUMBER_WORDS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve")
-# A pair of task and algorithm learns on D if the success in some part of its trainings on D is above this rate, %.
+# A pair of task and algorithm learns on a version if success in some part of its trainings is above this rate, %.
 LEARNED = 5
+# The number of parts of a training, and so of points of a curve.
+POINTS = 100
 
 
 def curves():
@@ -21,9 +23,10 @@ def curves():
     found = defaultdict(list)
     with CURVES.open() as file:
         for row in csv.DictReader(file):
-            assert int(row["runs"]) == len(CLEAN), row
+            assert (row["runs"], row["by"]) == (str(len(CLEAN)), "episodes"), row
             numbers = {name: float(row[name]) for name in row if name.endswith(("_mean", "_std"))}
             found[row["environment"], row["algorithm"], row["train"]].append(numbers)
+    assert {len(points) for points in found.values()} == {POINTS}
     return found
 
 
@@ -36,29 +39,38 @@ def counted(count, pairs):
 def during_training():
     """Return the rows and counts of the section on training curves."""
     found, texts = curves(), []
-    steadier, pairs = defaultdict(int), 0
+    steadier, pairs = defaultdict(int), defaultdict(int)
     for task in ENVIRONMENTS:
         for name in ALGORITHMS:
-            points = {version: found[task, name, version] for version in "DRE"}
+            points = {version: found[task, name, version] for version in "DRE" if (task, name, version) in found}
+            if not points:  # this pair was not trained
+                continue
+            learns = {
+                version: max(point["success_mean"] for point in each) > LEARNED for version, each in points.items()
+            }
             fields = []
             for quantity in ("return", "success"):
-                spreads = [fmean(point[f"{quantity}_std"] for point in each) for each in points.values()]
-                fields += [fixed(number) for number in spreads]
-                learned = max(point["success_mean"] for point in points["D"]) > LEARNED
-                for version, number in zip("RE", spreads[1:], strict=True):
-                    steadier[quantity, version] += learned and number < spreads[0]
-            pairs += learned
-            label = "" if learned else " (does not learn on D)"
-            texts.append(f"| {task} | {NAMES[name]}{label} | " + " | ".join(fields) + " |")
-    total = NUMBER_WORDS[pairs]
-    return [
-        *texts,
-        f"{total} pairs of task and algorithm that learn on D",
-        *(
-            fill(f"{{}} of the {total} pairs vary less on {version} by {quantity} ({{:.0f}} %)", *counted(count, pairs))
-            for (quantity, version), count in steadier.items()
-        ),
-    ]
+                spreads = {
+                    version: fmean(point[f"{quantity}_std"] for point in each) for version, each in points.items()
+                }
+                fields += map(fixed, spreads.values())
+                for version in "RE":
+                    comparable = learns["D"] and learns[version]
+                    pairs[version] += comparable and quantity == "return"
+                    steadier[quantity, version] += comparable and spreads[version] < spreads["D"]
+            texts.append(f"| {task} | {NAMES[name]} | " + " | ".join(fields) + " |")
+    for version in "RE":
+        count, tail = counted(steadier["return", version], pairs[version])
+        total, others = NUMBER_WORDS[pairs[version]], NUMBER_WORDS[steadier["success", version]]
+        less = {"R": "the return varies less on R than on D", "E": "less on E than on D"}[version]
+        success = {"R": f"Success varies less on R in all {others} pairs", "E": f"and on E in {others}"}[version]
+        texts += [
+            f"in {count} of {total} pairs {less}",
+            success,
+            fill(f"at least {count} of {total} would have a probability of {{:.0f}} %", tail),
+        ]
+    assert steadier["success", "R"] == pairs["R"]
+    return texts
 
 
 def final_policies(studies):
@@ -103,4 +115,10 @@ def final_policies(studies):
 
 def stability(studies):
     """Return the texts with numbers that the page must contain."""
-    return final_policies(studies)
+    for cell in studies.finished("questions/stability"):
+        if cell.trained_on != "E":  # questions/findings has the same training
+            wanted = {name: getattr(cell, name) for name in ("environment", "algorithm", "trained_on", "seed")}
+            (same,) = studies.finished("questions/findings", **wanted)
+            assert same.tests == cell.tests, f"{cell.cell} has other results in questions/findings"
+        done, _ = studies.planned("questions/stability")
+    return [f"{done} of 180 trainings are finished", *during_training(), *final_policies(studies)]
