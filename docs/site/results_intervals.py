@@ -53,6 +53,7 @@ PAGES = {
     "recurrent": [("t", "success", 3)],
     "reference-lines": [("t", "difference", 10)],
     "rl2-trials": [("t", "success", 3)],
+    "stability": [("t", "success", 5)],
     "training-contexts": [("t", "difference", 10)],
 }
 
