@@ -271,6 +271,8 @@ def intervals(studies):
             over = " over four tasks" if kind == "over_tasks" else ""
             fields = " | ".join(map(field, controls))
             texts.append(f"| {interval}, normal numbers{over} | {len(controls[0])} | {fields} |")
+        # The page says that differences that are mostly equal vary by less than one point.
+    assert all(np.ptp(each) < 1 for each in found["difference"] if mostly_equal(each))
     usual, high = ([wilson_coverage(rate, n) for rate in rates for n in EPISODES] for rates in (RATES, HIGH_RATES))
     return [
         *texts,

@@ -69,6 +69,8 @@ def during_training():
             success,
             fill(f"at least {count} of {total} would have a probability of {{:.0f}} %", tail),
         ]
+    every = NUMBER_WORDS[pairs["R"]]
+    texts.append(fill(f"{every} of {every} would have a probability of {{:.1f}} %", 100 / 2 ** pairs["R"]))
     assert steadier["success", "R"] == pairs["R"]
     return texts
 
