@@ -142,5 +142,5 @@ def stability(studies):
             wanted = {name: getattr(cell, name) for name in ("environment", "algorithm", "trained_on", "seed")}
             (same,) = studies.finished("questions/findings", **wanted)
             assert same.tests == cell.tests, f"{cell.cell} has other results in questions/findings"
-        done, _ = studies.planned("questions/stability")
+    done, _ = studies.planned("questions/stability")
     return [f"{done} of 180 trainings are finished", *during_training(), *final_policies(studies)]

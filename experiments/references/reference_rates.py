@@ -5,7 +5,7 @@ The scripts that draw figures import this module. docs/findings/reference-lines.
 
 import results_lines
 
-# Shades of grey that are visible on white and beside the colours of other lines.
+# A shade of grey that is visible on white and beside the colours of other lines.
 GREY = "0.35"
 STYLES = {"heuristic policy": "--", "upper bound": ":"}
 # The index of each version and metric in the lists of results_lines.
